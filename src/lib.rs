@@ -1,0 +1,9 @@
+//! voxcast turns a ring of camera images into a semantic voxel grid on a plain CPU.
+
+pub mod error;
+pub mod network;
+pub mod rig;
+pub mod scene;
+
+pub use error::{Error, ErrorKind, Result};
+pub use network::Network;
