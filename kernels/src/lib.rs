@@ -1,1 +1,13 @@
-//! The arithmetic of voxcast.
+//! The arithmetic of voxcast: scalar specification and SIMD bodies that agree in bits.
+//!
+//! Every kernel takes an [`Isa`] value and borrowed slices; none does I/O, allocates, starts threads or keeps state.
+//! Tensors are channels last.
+
+pub mod isa;
+pub mod math;
+pub mod panels;
+mod simd;
+
+pub use isa::{Isa, IsaError};
+pub use panels::Panels;
+pub use simd::{LANES, relu};

@@ -1,0 +1,88 @@
+//! The layout of packed weights: what the model file stores and what every product kernel reads.
+//!
+//! A matrix of `depth` rows (k) and `columns` columns (outputs) is cut into panels of [`LANES`] columns. A panel is
+//! k-major, so that a kernel walks it once from start to end; the last panel is filled with zero columns:
+//!
+//! ```text
+//! packed[(n / 16 * depth + k) * 16 + n % 16] = w[k][n]
+//! ```
+
+use crate::simd::LANES;
+use half::f16;
+
+/// Packed weights in the precision that they are stored in. Arithmetic is f32 in both cases; widening is exact.
+#[derive(Clone, Copy, Debug)]
+pub enum Panels<'a> {
+    /// Single precision.
+    F32(&'a [f32]),
+    /// Half precision, widened panel by panel while it is used.
+    F16(&'a [f16]),
+}
+
+impl Panels<'_> {
+    /// Numbers stored, the zero columns included.
+    pub fn len(&self) -> usize {
+        match self {
+            Panels::F32(w) => w.len(),
+            Panels::F16(w) => w.len(),
+        }
+    }
+
+    /// Whether nothing is stored.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The number at packed position `i`, widened. For the specification; bodies read whole panels.
+    #[inline]
+    pub fn get(&self, i: usize) -> f32 {
+        match self {
+            Panels::F32(w) => w[i],
+            Panels::F16(w) => w[i].to_f32(),
+        }
+    }
+}
+
+/// Numbers that a packed `depth` x `columns` matrix takes.
+pub const fn packed_len(depth: usize, columns: usize) -> usize {
+    columns.div_ceil(LANES) * LANES * depth
+}
+
+/// Where element (`k`, `n`) of a matrix of `depth` rows is stored.
+#[inline]
+pub const fn packed_index(depth: usize, k: usize, n: usize) -> usize {
+    (n / LANES * depth + k) * LANES + n % LANES
+}
+
+/// Packs the matrix whose element (k, n) is `w(k, n)`.
+///
+/// # Panics
+/// If `out` is not [`packed_len`] long.
+pub fn pack(depth: usize, columns: usize, w: impl Fn(usize, usize) -> f32, out: &mut [f32]) {
+    assert_eq!(out.len(), packed_len(depth, columns), "packed weights have another size");
+    out.fill(0.0);
+    for n in 0..columns {
+        for k in 0..depth {
+            out[packed_index(depth, k, n)] = w(k, n);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_element_has_its_own_place_and_the_rest_is_zero() {
+        for (depth, columns) in [(1, 1), (3, 16), (2, 17), (5, 40)] {
+            let mut out = vec![9.0; packed_len(depth, columns)];
+            pack(depth, columns, |k, n| (k * 100 + n + 1) as f32, &mut out);
+            for n in 0..columns {
+                for k in 0..depth {
+                    assert_eq!(out[packed_index(depth, k, n)], (k * 100 + n + 1) as f32);
+                }
+            }
+            assert_eq!(out.iter().filter(|&&v| v != 0.0).count(), depth * columns);
+        }
+    }
+}

@@ -1,0 +1,149 @@
+//! Sixteen virtual lanes: the one vector type that kernel bodies are written over.
+//!
+//! A body is written once as `fn run<S: Simd>(self, s: S)` and instantiated per instruction set by [`dispatch`]. A vector
+//! always has [`LANES`] lanes, whatever the register width (AVX2 uses a pair of registers), so that packed weights,
+//! partial sums and tails look the same everywhere. The scalar instruction set has no vector: it runs the kernel's
+//! `reference`, which is the specification.
+
+use crate::isa::Isa;
+use half::f16;
+
+#[cfg(target_arch = "x86_64")]
+mod avx2;
+
+/// Lanes of a vector on every instruction set, and columns of a packed weight panel.
+pub const LANES: usize = 16;
+
+/// The vector operations of one instruction set.
+///
+/// Implementors are zero-sized tokens that prove the instructions exist; their methods are `#[inline(always)]` so that
+/// they compile inside the one `#[target_feature]` function of [`dispatch`].
+pub(crate) trait Simd: Copy {
+    /// Sixteen f32 lanes.
+    type V: Copy;
+
+    /// All lanes `x`.
+    fn splat(self, x: f32) -> Self::V;
+    /// Reads 16 lanes from `p`.
+    ///
+    /// # Safety
+    /// `p` must be valid for reading 16 consecutive f32; no alignment is needed.
+    unsafe fn load_ptr(self, p: *const f32) -> Self::V;
+    /// Writes 16 lanes to `p`.
+    ///
+    /// # Safety
+    /// `p` must be valid for writing 16 consecutive f32; no alignment is needed.
+    unsafe fn store_ptr(self, p: *mut f32, v: Self::V);
+    /// Widens 16 half-precision numbers, exactly.
+    fn widen(self, x: &[f16; LANES]) -> Self::V;
+    /// `a + b`.
+    fn add(self, a: Self::V, b: Self::V) -> Self::V;
+    /// `a - b`.
+    fn sub(self, a: Self::V, b: Self::V) -> Self::V;
+    /// `a * b`.
+    fn mul(self, a: Self::V, b: Self::V) -> Self::V;
+    /// `a / b`, correctly rounded.
+    fn div(self, a: Self::V, b: Self::V) -> Self::V;
+    /// `a * b + c`, rounded once.
+    fn mul_add(self, a: Self::V, b: Self::V, c: Self::V) -> Self::V;
+    /// `if a > b { a } else { b }` in every lane: `b` where either is NaN or both are zero.
+    fn max(self, a: Self::V, b: Self::V) -> Self::V;
+    /// `if a < b { a } else { b }` in every lane: `b` where either is NaN or both are zero.
+    fn min(self, a: Self::V, b: Self::V) -> Self::V;
+    /// Nearest integer, ties to even.
+    fn round(self, a: Self::V) -> Self::V;
+    /// 2 to the power `n`, for integral lanes from -126 to 127.
+    fn exp2_int(self, n: Self::V) -> Self::V;
+
+    /// Reads 16 lanes.
+    #[inline(always)]
+    fn load(self, x: &[f32; LANES]) -> Self::V {
+        // SAFETY: the array holds exactly 16 f32.
+        unsafe { self.load_ptr(x.as_ptr()) }
+    }
+    /// Writes 16 lanes.
+    #[inline(always)]
+    fn store(self, x: &mut [f32; LANES], v: Self::V) {
+        // SAFETY: the array holds exactly 16 f32.
+        unsafe { self.store_ptr(x.as_mut_ptr(), v) }
+    }
+    /// Reads the first lanes from up to 16 numbers; the others are 0.
+    #[inline(always)]
+    fn load_part(self, x: &[f32]) -> Self::V {
+        match x.first_chunk() {
+            Some(x) => self.load(x),
+            None => {
+                let mut lanes = [0.0; LANES];
+                lanes[..x.len()].copy_from_slice(x);
+                self.load(&lanes)
+            }
+        }
+    }
+    /// Writes the first lanes into up to 16 numbers.
+    #[inline(always)]
+    fn store_part(self, x: &mut [f32], v: Self::V) {
+        match x.first_chunk_mut() {
+            Some(x) => self.store(x, v),
+            None => {
+                let mut lanes = [0.0; LANES];
+                self.store(&mut lanes, v);
+                let n = x.len();
+                x.copy_from_slice(&lanes[..n]);
+            }
+        }
+    }
+    /// `if x < 0 { 0 } else { x }`: NaN and -0 pass.
+    #[inline(always)]
+    fn relu(self, x: Self::V) -> Self::V {
+        self.max(self.splat(0.0), x)
+    }
+    /// The lanes as numbers.
+    #[inline(always)]
+    fn lanes(self, v: Self::V) -> [f32; LANES] {
+        let mut lanes = [0.0; LANES];
+        self.store(&mut lanes, v);
+        lanes
+    }
+}
+
+/// Rectifier of the specification: `if x < 0 { 0 } else { x }`, so that NaN stays visible.
+#[inline(always)]
+pub fn relu(x: f32) -> f32 {
+    if x < 0.0 { 0.0 } else { x }
+}
+
+/// Sum of 16 lanes by one fixed tree: halves, quarters, pairs.
+#[inline(always)]
+pub(crate) fn tree_sum(mut x: [f32; LANES]) -> f32 {
+    for half in [8, 4, 2, 1] {
+        for i in 0..half {
+            x[i] += x[i + half];
+        }
+    }
+    x[0]
+}
+
+/// One kernel call with its arguments: the specification, and the body that vector instruction sets share.
+pub(crate) trait Kernel: Sized {
+    /// What the call returns.
+    type Output;
+    /// The specification: plain loops in the order of the bit contract.
+    fn reference(self) -> Self::Output;
+    /// The same bits with vectors. Must be `#[inline(always)]`.
+    fn run<S: Simd>(self, s: S) -> Self::Output;
+}
+
+/// Runs `kernel` on `isa`.
+#[inline]
+pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
+    match isa {
+        Isa::Scalar => kernel.reference(),
+        #[cfg(target_arch = "x86_64")]
+        Isa::Avx2(token) => {
+            // SAFETY: the token proves that this CPU has AVX2, FMA and F16C.
+            unsafe { avx2::run(token, kernel) }
+        }
+        #[cfg(not(target_arch = "x86_64"))]
+        Isa::Avx2(_) => unreachable!("the token is never made on this architecture"),
+    }
+}

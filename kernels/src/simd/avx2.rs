@@ -1,0 +1,93 @@
+//! AVX2 + FMA + F16C: a vector is a pair of 8-lane registers.
+
+use super::{Kernel, LANES, Simd};
+use crate::isa::Avx2;
+use core::arch::x86_64::*;
+use half::f16;
+
+/// Instantiates `kernel`'s body with the instructions enabled.
+///
+/// # Safety
+/// The CPU must have AVX2, FMA and F16C, which an [`Avx2`] token proves.
+#[target_feature(enable = "avx2,fma,f16c")]
+pub(super) unsafe fn run<K: Kernel>(token: Avx2, kernel: K) -> K::Output {
+    kernel.run(token)
+}
+
+/// Applies a lane-wise intrinsic to both halves.
+macro_rules! halves {
+    ($op:ident($($x:expr),*)) => {
+        // SAFETY: the token `self` proves that the CPU has AVX2 and FMA.
+        unsafe { [$op($($x[0]),*), $op($($x[1]),*)] }
+    };
+}
+
+impl Simd for Avx2 {
+    type V = [__m256; 2];
+
+    #[inline(always)]
+    fn splat(self, x: f32) -> Self::V {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        unsafe { [_mm256_set1_ps(x); 2] }
+    }
+    #[inline(always)]
+    unsafe fn load_ptr(self, p: *const f32) -> Self::V {
+        // SAFETY: the caller promises 16 readable f32 at `p`; the token proves AVX2.
+        unsafe { [_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(8))] }
+    }
+    #[inline(always)]
+    unsafe fn store_ptr(self, p: *mut f32, v: Self::V) {
+        // SAFETY: the caller promises 16 writable f32 at `p`; the token proves AVX2.
+        unsafe {
+            _mm256_storeu_ps(p, v[0]);
+            _mm256_storeu_ps(p.add(8), v[1]);
+        }
+    }
+    #[inline(always)]
+    fn widen(self, x: &[f16; LANES]) -> Self::V {
+        let p = x.as_ptr().cast::<__m128i>();
+        // SAFETY: the array is 32 bytes, read as two unaligned 16-byte halves; the token proves F16C.
+        unsafe { [_mm256_cvtph_ps(_mm_loadu_si128(p)), _mm256_cvtph_ps(_mm_loadu_si128(p.add(1)))] }
+    }
+    #[inline(always)]
+    fn add(self, a: Self::V, b: Self::V) -> Self::V {
+        halves!(_mm256_add_ps(a, b))
+    }
+    #[inline(always)]
+    fn sub(self, a: Self::V, b: Self::V) -> Self::V {
+        halves!(_mm256_sub_ps(a, b))
+    }
+    #[inline(always)]
+    fn mul(self, a: Self::V, b: Self::V) -> Self::V {
+        halves!(_mm256_mul_ps(a, b))
+    }
+    #[inline(always)]
+    fn div(self, a: Self::V, b: Self::V) -> Self::V {
+        halves!(_mm256_div_ps(a, b))
+    }
+    #[inline(always)]
+    fn mul_add(self, a: Self::V, b: Self::V, c: Self::V) -> Self::V {
+        halves!(_mm256_fmadd_ps(a, b, c))
+    }
+    #[inline(always)]
+    fn max(self, a: Self::V, b: Self::V) -> Self::V {
+        halves!(_mm256_max_ps(a, b))
+    }
+    #[inline(always)]
+    fn min(self, a: Self::V, b: Self::V) -> Self::V {
+        halves!(_mm256_min_ps(a, b))
+    }
+    #[inline(always)]
+    fn round(self, a: Self::V) -> Self::V {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        a.map(|a| unsafe { _mm256_round_ps::<{ _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC }>(a) })
+    }
+    #[inline(always)]
+    fn exp2_int(self, n: Self::V) -> Self::V {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        n.map(|n| unsafe {
+            let biased = _mm256_add_epi32(_mm256_cvtps_epi32(n), _mm256_set1_epi32(127));
+            _mm256_castsi256_ps(_mm256_slli_epi32::<23>(biased))
+        })
+    }
+}
