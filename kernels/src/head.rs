@@ -162,16 +162,17 @@ impl Kernel for Run<'_> {
         self.blocks(
             #[inline(always)]
             |first, count, [a, b, logits, scratch]| {
-                let mut layer = #[inline(always)]
-                |layer: usize, data: &[f32], to: &mut [f32]| {
-                    let p = args.layer(layer);
-                    let source = Rows { data, stride: args.channels };
-                    product(s, &p, &source, &Linear { first: 0, stride: p.columns }, 0..count, to, scratch);
-                };
-                layer(0, &args.input[first * args.channels..], a);
-                layer(1, a, b);
-                layer(2, b, logits);
+                layer(s, &args.layer(0), &args.input[first * args.channels..], a, count, scratch);
+                layer(s, &args.layer(1), a, b, count, scratch);
+                layer(s, &args.layer(2), b, logits, count, scratch);
             },
         );
     }
+}
+
+/// One layer on `count` rows.
+#[inline(always)]
+fn layer<S: Simd>(s: S, p: &Product<'_>, data: &[f32], to: &mut [f32], count: usize, scratch: &mut [f32]) {
+    let source = Rows { data, stride: p.depth };
+    product(s, p, &source, &Linear { first: 0, stride: p.columns }, 0..count, to, scratch);
 }
