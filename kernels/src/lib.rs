@@ -3,10 +3,18 @@
 //! Every kernel takes an [`Isa`] value and borrowed slices; none does I/O, allocates, starts threads or keeps state.
 //! Tensors are channels last.
 
+pub mod depthwise;
+pub mod gate;
 pub mod isa;
 pub mod math;
+pub mod max_pool;
 pub mod panels;
+pub mod pool;
+pub mod scale_shift;
 mod simd;
+#[cfg(test)]
+mod testing;
+pub mod upsample_add;
 
 pub use isa::{Isa, IsaError};
 pub use panels::Panels;
