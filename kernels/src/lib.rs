@@ -15,6 +15,7 @@ mod simd;
 #[cfg(test)]
 mod testing;
 pub mod upsample_add;
+pub mod window_attention;
 
 pub use isa::{Isa, IsaError};
 pub use panels::Panels;
