@@ -6,15 +6,24 @@
 pub mod conv;
 pub mod deconv3d;
 pub mod deform_conv2d;
+pub mod depthwise;
+pub mod gate;
 pub mod gather;
 pub mod head;
 pub mod isa;
 pub mod math;
+pub mod max_pool;
 pub mod normalise;
 pub mod panels;
 pub mod peak;
+pub mod pool;
 pub mod product;
+pub mod scale_shift;
 mod simd;
+#[cfg(test)]
+mod testing;
+pub mod upsample_add;
+pub mod window_attention;
 
 pub use isa::{Isa, IsaError};
 pub use panels::Panels;

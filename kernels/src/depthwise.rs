@@ -1,0 +1,349 @@
+//! Depthwise two-dimensional convolution: every channel has its own k x k kernel.
+//!
+//! ```text
+//! out[y][x][c] = bias[c] + sum over (ky, kx), in that order, of in[y + ky - k/2][x + kx - k/2][c] * weight[ky][kx][c]
+//!                (+ in[y][x][c])
+//! ```
+//!
+//! Stride 1, zero padding k/2, so the output has the shape of the input. The sum is one chain of fused multiply-adds
+//! that starts at the bias; taps outside count as in = 0 and stay in the chain; the residual joins last.
+//!
+//! The body runs sixteen channels at a time and, where no tap leaves the row, [`BLOCK`] neighbouring columns, which
+//! share each load of weights. Neither touches the order of a chain.
+
+use crate::isa::Isa;
+use crate::simd::{Kernel, LANES, Simd, dispatch};
+use std::ops::Range;
+
+/// Columns that are computed together: 8 accumulators of 8 lanes leave registers for weights and inputs.
+const BLOCK: usize = 4;
+
+/// A depthwise convolution's arguments.
+#[derive(Clone, Copy, Debug)]
+pub struct Depthwise<'a> {
+    /// `[height, width, channels]`.
+    pub input: &'a [f32],
+    /// Rows of the input and of the output.
+    pub height: usize,
+    /// Columns of the input and of the output.
+    pub width: usize,
+    /// Channels.
+    pub channels: usize,
+    /// Side of the kernel, odd.
+    pub kernel: usize,
+    /// `[kernel, kernel, channels]`, each tap's channels padded with anything to a multiple of 16.
+    pub weights: &'a [f32],
+    /// One number per channel, padded likewise.
+    pub bias: &'a [f32],
+    /// Whether the input itself is added.
+    pub residual: bool,
+}
+
+impl Depthwise<'_> {
+    fn check(&self, rows: &Range<usize>, out: &[f32]) {
+        let padded = self.channels.next_multiple_of(LANES);
+        assert!(self.channels > 0 && self.width > 0, "an extent is zero");
+        assert!(self.kernel % 2 == 1, "the kernel's side is not odd");
+        assert_eq!(self.input.len(), self.height * self.width * self.channels, "the input has another shape");
+        assert_eq!(self.weights.len(), self.kernel * self.kernel * padded, "the weights have another shape");
+        assert_eq!(self.bias.len(), padded, "the bias has another length");
+        assert!(rows.start <= rows.end && rows.end <= self.height, "rows {rows:?} of {}", self.height);
+        assert_eq!(out.len(), rows.len() * self.width * self.channels, "the output is not the size of its rows");
+    }
+}
+
+/// Computes the output rows `rows` into `out`, `[rows, width, channels]`.
+///
+/// # Panics
+/// If the kernel's side is even, `rows` leaves the image, or a slice does not have the size that the shapes ask for.
+///
+/// # Determinism
+/// The same bits on every instruction set and for every division into rows.
+pub fn depthwise(isa: Isa, args: &Depthwise<'_>, rows: Range<usize>, out: &mut [f32]) {
+    args.check(&rows, out);
+    dispatch(isa, Run { args, rows, out });
+}
+
+/// One call whose arguments fit together.
+pub(crate) struct Run<'a> {
+    pub(crate) args: &'a Depthwise<'a>,
+    pub(crate) rows: Range<usize>,
+    pub(crate) out: &'a mut [f32],
+}
+
+impl Kernel for Run<'_> {
+    type Output = ();
+
+    fn reference(self) {
+        let a = self.args;
+        let padded = a.channels.next_multiple_of(LANES);
+        for (i, out) in self.out.iter_mut().enumerate() {
+            let (c, x) = (i % a.channels, i / a.channels % a.width);
+            let y = self.rows.start + i / (a.channels * a.width);
+            let mut sum = a.bias[c];
+            for ky in 0..a.kernel {
+                for kx in 0..a.kernel {
+                    let input = a.offset(y + ky, x + kx).map_or(0.0, |at| a.input[at + c]);
+                    sum = input.mul_add(a.weights[(ky * a.kernel + kx) * padded + c], sum);
+                }
+            }
+            if a.residual {
+                sum += a.input[(y * a.width + x) * a.channels + c];
+            }
+            *out = sum;
+        }
+    }
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let a = self.args;
+        let half = a.kernel / 2;
+        for (y, out) in self.rows.zip(self.out.chunks_exact_mut(a.width * a.channels)) {
+            let mut x = 0;
+            while x < a.width {
+                let pixels = &mut out[x * a.channels..];
+                if x >= half && x + BLOCK + half <= a.width {
+                    a.columns::<S, BLOCK>(s, y, x, &mut pixels[..BLOCK * a.channels]);
+                    x += BLOCK;
+                } else {
+                    a.columns::<S, 1>(s, y, x, &mut pixels[..a.channels]);
+                    x += 1;
+                }
+            }
+        }
+    }
+}
+
+impl Depthwise<'_> {
+    /// Where the pixel at (`y`, `x`) of the zero-padded input is stored, or `None` in the padding.
+    #[inline(always)]
+    fn offset(&self, y: usize, x: usize) -> Option<usize> {
+        let (y, x) = (y.wrapping_sub(self.kernel / 2), x.wrapping_sub(self.kernel / 2));
+        (y < self.height && x < self.width).then(|| (y * self.width + x) * self.channels)
+    }
+
+    /// All channels of the `N` columns from `x` on in row `y`. For N > 1 no tap may leave the row.
+    #[inline(always)]
+    fn columns<S: Simd, const N: usize>(&self, s: S, y: usize, x: usize, out: &mut [f32]) {
+        let padded = self.channels.next_multiple_of(LANES);
+        for c in (0..self.channels).step_by(LANES) {
+            let lanes = LANES.min(self.channels - c);
+            let mut sum = [s.load_part(&self.bias[c..]); N];
+            for ky in 0..self.kernel {
+                for kx in 0..self.kernel {
+                    let w = s.load_part(&self.weights[(ky * self.kernel + kx) * padded + c..]);
+                    match self.offset(y + ky, x + kx) {
+                        Some(at) => {
+                            for (i, sum) in sum.iter_mut().enumerate() {
+                                let input = s.load_part(&self.input[at + i * self.channels + c..][..lanes]);
+                                *sum = s.mul_add(input, w, *sum);
+                            }
+                        }
+                        None => {
+                            for sum in &mut sum {
+                                *sum = s.mul_add(s.splat(0.0), w, *sum);
+                            }
+                        }
+                    }
+                }
+            }
+            for (i, &sum) in sum.iter().enumerate() {
+                let mut sum = sum;
+                if self.residual {
+                    let at = ((y * self.width + x) + i) * self.channels + c;
+                    sum = s.add(sum, s.load_part(&self.input[at..][..lanes]));
+                }
+                s.store_part(&mut out[i * self.channels + c..][..lanes], sum);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{Fill, Rng, assert_close, assert_lively, assert_same_bits, pad_rows};
+    use proptest::prelude::*;
+
+    struct Case {
+        shape: [usize; 3],
+        kernel: usize,
+        residual: bool,
+        input: Vec<f32>,
+        weights: Vec<f32>,
+        bias: Vec<f32>,
+    }
+
+    impl Case {
+        fn new(shape: [usize; 3], kernel: usize, residual: bool, seed: u64, fill: Fill) -> Self {
+            let [h, w, c] = shape;
+            let mut rng = Rng::new(seed);
+            let input = fill(&mut rng, h * w * c);
+            let weights = pad_rows(&rng.wide(kernel * kernel * c), c, f32::NAN);
+            Self { shape, kernel, residual, input, weights, bias: pad_rows(&rng.wide(c), c, f32::NAN) }
+        }
+
+        fn args(&self) -> Depthwise<'_> {
+            let [height, width, channels] = self.shape;
+            let Self { kernel, residual, ref input, ref weights, ref bias, .. } = *self;
+            Depthwise { input, height, width, channels, kernel, weights, bias, residual }
+        }
+
+        fn rows(&self, isa: Isa, rows: Range<usize>) -> Vec<f32> {
+            let mut out = vec![f32::NAN; rows.len() * self.shape[1] * self.shape[2]];
+            depthwise(isa, &self.args(), rows, &mut out);
+            out
+        }
+
+        fn all(&self, isa: Isa) -> Vec<f32> {
+            self.rows(isa, 0..self.shape[0])
+        }
+    }
+
+    #[test]
+    fn by_hand() {
+        // A 2 x 3 image of ones, bias 100 and the weights 1 to 9: each output is the sum of the taps inside.
+        let mut case = Case::new([2, 3, 1], 3, false, 0, Rng::ordinary);
+        case.input = vec![1.0; 6];
+        case.weights = pad_rows(&[1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0], 1, 0.0);
+        case.bias = pad_rows(&[100.0], 1, 0.0);
+        for isa in Isa::available() {
+            case.residual = false;
+            assert_eq!(case.all(isa), [128.0, 139.0, 124.0, 116.0, 121.0, 112.0]);
+            case.residual = true;
+            assert_eq!(case.all(isa), [129.0, 140.0, 125.0, 117.0, 122.0, 113.0]);
+        }
+    }
+
+    /// Channels around 16, widths around the kernel and the block.
+    const SHAPES: [([usize; 3], usize); 9] = [
+        ([1, 1, 16], 3),
+        ([3, 7, 1], 3),
+        ([2, 6, 5], 5),
+        ([4, 9, 15], 3),
+        ([5, 5, 16], 1),
+        ([7, 7, 16], 5),
+        ([3, 13, 17], 7),
+        ([6, 8, 33], 3),
+        ([4, 12, 64], 5),
+    ];
+
+    #[test]
+    fn every_isa_gives_the_scalar_bits() {
+        for (shape, kernel) in SHAPES {
+            for (residual, fill) in [(false, Rng::wide as Fill), (true, Rng::wide), (true, Rng::special)] {
+                let case = Case::new(shape, kernel, residual, 7, fill);
+                let want = case.all(Isa::Scalar);
+                assert_lively(&want, &format!("{shape:?}, kernel {kernel}"));
+                for isa in Isa::available() {
+                    assert_same_bits(&case.all(isa), &want, &format!("{isa:?} {shape:?}, kernel {kernel}"));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn padding_stays_in_the_chain() {
+        // 0 * inf is NaN: a body that skips taps in the padding differs at the border.
+        for isa in Isa::available() {
+            let mut case = Case::new([3, 9, 16], 3, false, 1, Rng::ordinary);
+            case.weights[3] = f32::INFINITY;
+            let out = case.all(isa);
+            assert!(out[3].is_nan());
+            assert!(out[(9 + 1) * 16 + 3].is_infinite());
+            assert!(out.iter().skip(4).step_by(16).all(|v| v.is_finite()));
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn any_shape_gives_the_scalar_bits(
+            h in 1usize..6, w in 1usize..14, c in 1usize..40, half in 0usize..4, residual: bool, seed: u64,
+        ) {
+            let case = Case::new([h, w, c], 2 * half + 1, residual, seed, Rng::wide);
+            let want = case.all(Isa::Scalar);
+            for isa in Isa::available() {
+                assert_same_bits(&case.all(isa), &want, "whole");
+                let split = h / 2;
+                assert_same_bits(&[case.rows(isa, 0..split), case.rows(isa, split..h)].concat(), &want, "split");
+            }
+        }
+    }
+
+    #[test]
+    fn the_scalar_code_agrees_with_f64() {
+        for (shape, kernel) in SHAPES {
+            let mut case = Case::new(shape, kernel, true, 3, Rng::ordinary);
+            let [h, w, c] = shape;
+            case.weights = Rng::new(4).ordinary(case.weights.len());
+            case.bias = Rng::new(5).ordinary(case.bias.len());
+            let half = kernel as isize / 2;
+            let want: Vec<f64> = (0..h * w * c)
+                .map(|i| {
+                    let (y, x, ch) = ((i / (w * c)) as isize, (i / c % w) as isize, i % c);
+                    let mut sum = f64::from(case.bias[ch]) + f64::from(case.input[i]);
+                    for (dy, dx) in (-half..=half).flat_map(|dy| (-half..=half).map(move |dx| (dy, dx))) {
+                        if (0..h as isize).contains(&(y + dy)) && (0..w as isize).contains(&(x + dx)) {
+                            let at = ((y + dy) as usize * w + (x + dx) as usize) * c + ch;
+                            let tap = ((dy + half) * kernel as isize + dx + half) as usize;
+                            let weight = case.weights[tap * c.next_multiple_of(LANES) + ch];
+                            sum += f64::from(case.input[at]) * f64::from(weight);
+                        }
+                    }
+                    sum
+                })
+                .collect();
+            assert_close(&case.all(Isa::Scalar), &want, 4e-6, &format!("{shape:?}"));
+        }
+    }
+
+    #[test]
+    #[should_panic(expected = "the kernel's side is not odd")]
+    fn even_kernel() {
+        Case::new([3, 3, 4], 2, false, 0, Rng::ordinary).all(Isa::Scalar);
+    }
+
+    #[test]
+    #[should_panic(expected = "the input has another shape")]
+    fn short_input() {
+        let mut case = Case::new([3, 3, 4], 3, false, 0, Rng::ordinary);
+        case.input.pop();
+        case.all(Isa::Scalar);
+    }
+
+    #[test]
+    #[should_panic(expected = "the weights have another shape")]
+    fn unpadded_weights() {
+        let mut case = Case::new([3, 3, 4], 3, false, 0, Rng::ordinary);
+        case.weights.truncate(36);
+        case.all(Isa::Scalar);
+    }
+
+    #[test]
+    #[should_panic(expected = "the bias has another length")]
+    fn short_bias() {
+        let mut case = Case::new([3, 3, 4], 3, false, 0, Rng::ordinary);
+        case.bias.pop();
+        case.all(Isa::Scalar);
+    }
+
+    #[test]
+    #[should_panic(expected = "rows 2..4 of 3")]
+    fn rows_outside() {
+        Case::new([3, 3, 4], 3, false, 0, Rng::ordinary).rows(Isa::Scalar, 2..4);
+    }
+
+    #[test]
+    #[should_panic(expected = "the output is not the size of its rows")]
+    fn short_output() {
+        let case = Case::new([3, 3, 4], 3, false, 0, Rng::ordinary);
+        depthwise(Isa::Scalar, &case.args(), 0..2, &mut [0.0; 23]);
+    }
+
+    #[test]
+    #[should_panic(expected = "an extent is zero")]
+    fn no_channels() {
+        let case = Case::new([3, 3, 1], 3, false, 0, Rng::ordinary);
+        depthwise(Isa::Scalar, &Depthwise { channels: 0, ..case.args() }, 0..0, &mut []);
+    }
+}

@@ -1,0 +1,234 @@
+//! One factor and one addend per channel, in place: a normalisation that could not be folded into a convolution.
+//!
+//! ```text
+//! y = x * scale[c] + shift[c]        rounded once
+//! y = y + residual[row][c]           if there is a residual
+//! y = if y < 0 { 0 } else { y }      if asked for; NaN stays
+//! ```
+//!
+//! The body does sixteen channels at a time.
+
+use crate::isa::Isa;
+use crate::simd::{Kernel, LANES, Simd, dispatch, relu};
+
+/// The arguments of a scaling.
+#[derive(Clone, Copy, Debug)]
+pub struct ScaleShift<'a> {
+    /// One factor per channel, padded with anything to a multiple of 16.
+    pub scale: &'a [f32],
+    /// One addend per channel, padded likewise.
+    pub shift: &'a [f32],
+    /// Channels.
+    pub channels: usize,
+    /// `[rows, channels]` added after the shift.
+    pub residual: Option<&'a [f32]>,
+    /// Whether negative results become 0, after the residual.
+    pub relu: bool,
+}
+
+impl ScaleShift<'_> {
+    fn check(&self, rows: &[f32]) {
+        let padded = self.channels.next_multiple_of(LANES);
+        assert!(self.channels > 0, "an extent is zero");
+        assert_eq!(self.scale.len(), padded, "the scale has another length");
+        assert_eq!(self.shift.len(), padded, "the shift has another length");
+        assert!(rows.len().is_multiple_of(self.channels), "the tensor is not whole rows");
+        assert!(self.residual.is_none_or(|r| r.len() == rows.len()), "the residual has another shape");
+    }
+}
+
+/// Replaces `rows`, `[rows, channels]`. To divide rows among threads, divide the residual alike.
+///
+/// # Panics
+/// If a slice does not have the size that the shapes ask for.
+///
+/// # Determinism
+/// The same bits on every instruction set and for every division into rows.
+pub fn scale_shift(isa: Isa, args: &ScaleShift<'_>, rows: &mut [f32]) {
+    args.check(rows);
+    dispatch(isa, Run { args, rows });
+}
+
+struct Run<'a> {
+    args: &'a ScaleShift<'a>,
+    rows: &'a mut [f32],
+}
+
+impl Kernel for Run<'_> {
+    type Output = ();
+
+    fn reference(self) {
+        let a = self.args;
+        for (i, x) in self.rows.iter_mut().enumerate() {
+            let c = i % a.channels;
+            let mut y = x.mul_add(a.scale[c], a.shift[c]);
+            if let Some(residual) = a.residual {
+                y += residual[i];
+            }
+            *x = if a.relu { relu(y) } else { y };
+        }
+    }
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let a = self.args;
+        for (row, x) in self.rows.chunks_exact_mut(a.channels).enumerate() {
+            for (panel, x) in x.chunks_mut(LANES).enumerate() {
+                let c = panel * LANES;
+                let mut y = s.mul_add(s.load_part(x), s.load_part(&a.scale[c..]), s.load_part(&a.shift[c..]));
+                if let Some(residual) = a.residual {
+                    y = s.add(y, s.load_part(&residual[row * a.channels + c..][..x.len()]));
+                }
+                if a.relu {
+                    y = s.relu(y);
+                }
+                s.store_part(x, y);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{Fill, Rng, assert_close, assert_lively, assert_same_bits, pad_rows};
+    use proptest::prelude::*;
+
+    struct Case {
+        channels: usize,
+        relu: bool,
+        x: Vec<f32>,
+        scale: Vec<f32>,
+        shift: Vec<f32>,
+        residual: Option<Vec<f32>>,
+    }
+
+    impl Case {
+        fn new(rows: usize, channels: usize, residual: bool, relu: bool, seed: u64, fill: Fill) -> Self {
+            let mut rng = Rng::new(seed);
+            let x = fill(&mut rng, rows * channels);
+            let scale = pad_rows(&fill(&mut rng, channels), channels, f32::NAN);
+            let shift = pad_rows(&fill(&mut rng, channels), channels, f32::NAN);
+            let residual = residual.then(|| fill(&mut rng, rows * channels));
+            Self { channels, relu, x, scale, shift, residual }
+        }
+
+        fn args(&self) -> ScaleShift<'_> {
+            let Self { channels, relu, ref scale, ref shift, ref residual, .. } = *self;
+            ScaleShift { scale, shift, channels, residual: residual.as_deref(), relu }
+        }
+
+        fn all(&self, isa: Isa) -> Vec<f32> {
+            let mut rows = self.x.clone();
+            scale_shift(isa, &self.args(), &mut rows);
+            rows
+        }
+    }
+
+    #[test]
+    fn by_hand() {
+        let mut case = Case::new(2, 2, true, false, 0, Rng::ordinary);
+        case.x = vec![1.0, 2.0, 3.0, -4.0];
+        case.scale = pad_rows(&[2.0, 10.0], 2, 0.0);
+        case.shift = pad_rows(&[0.5, -1.0], 2, 0.0);
+        for isa in Isa::available() {
+            case.residual = None;
+            case.relu = false;
+            assert_eq!(case.all(isa), [2.5, 19.0, 6.5, -41.0]);
+            case.relu = true;
+            assert_eq!(case.all(isa), [2.5, 19.0, 6.5, 0.0]);
+            // The rectifier comes after the residual: -41 + 50 stays.
+            case.residual = Some(vec![0.0, -20.0, 1.0, 50.0]);
+            assert_eq!(case.all(isa), [2.5, 0.0, 7.5, 9.0]);
+        }
+    }
+
+    const SHAPES: [[usize; 2]; 8] = [[1, 16], [40, 1], [7, 5], [4, 15], [5, 16], [3, 17], [2, 33], [6, 64]];
+
+    #[test]
+    fn every_isa_gives_the_scalar_bits() {
+        for [rows, channels] in SHAPES {
+            for (residual, relu) in [(false, false), (false, true), (true, false), (true, true)] {
+                for fill in [Rng::wide as Fill, Rng::special] {
+                    let case = Case::new(rows, channels, residual, relu, 4, fill);
+                    let want = case.all(Isa::Scalar);
+                    assert_lively(&want, &format!("{rows} x {channels}"));
+                    for isa in Isa::available() {
+                        assert_same_bits(&case.all(isa), &want, &format!("{isa:?} {rows} x {channels}"));
+                    }
+                }
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn any_shape_gives_the_scalar_bits(
+            rows in 0usize..12, channels in 1usize..70, residual: bool, relu: bool, seed: u64,
+        ) {
+            let case = Case::new(rows, channels, residual, relu, seed, Rng::wide);
+            let want = case.all(Isa::Scalar);
+            for isa in Isa::available() {
+                assert_same_bits(&case.all(isa), &want, "whole");
+                let mut split = case.x.clone();
+                let at = rows / 2 * channels;
+                let (top, bottom) = split.split_at_mut(at);
+                for (part, range) in [(top, 0..at), (bottom, at..rows * channels)] {
+                    let residual = case.residual.as_ref().map(|r| &r[range]);
+                    scale_shift(isa, &ScaleShift { residual, ..case.args() }, part);
+                }
+                assert_same_bits(&split, &want, "split");
+            }
+        }
+    }
+
+    #[test]
+    fn the_scalar_code_agrees_with_f64() {
+        for [rows, channels] in SHAPES {
+            let case = Case::new(rows, channels, true, true, 5, Rng::ordinary);
+            let residual = case.residual.as_ref().unwrap();
+            let want: Vec<f64> = (0..rows * channels)
+                .map(|i| {
+                    let [x, scale, shift, residual] =
+                        [case.x[i], case.scale[i % channels], case.shift[i % channels], residual[i]].map(f64::from);
+                    (x * scale + shift + residual).max(0.0)
+                })
+                .collect();
+            assert_close(&case.all(Isa::Scalar), &want, 3e-7, &format!("{rows} x {channels}"));
+        }
+    }
+
+    fn case() -> Case {
+        Case::new(3, 4, true, true, 0, Rng::ordinary)
+    }
+
+    #[test]
+    #[should_panic(expected = "an extent is zero")]
+    fn no_channels() {
+        scale_shift(Isa::Scalar, &ScaleShift { channels: 0, ..case().args() }, &mut []);
+    }
+
+    #[test]
+    #[should_panic(expected = "the scale has another length")]
+    fn unpadded_scale() {
+        scale_shift(Isa::Scalar, &ScaleShift { scale: &[0.0; 4], ..case().args() }, &mut [0.0; 12]);
+    }
+
+    #[test]
+    #[should_panic(expected = "the shift has another length")]
+    fn unpadded_shift() {
+        scale_shift(Isa::Scalar, &ScaleShift { shift: &[0.0; 4], ..case().args() }, &mut [0.0; 12]);
+    }
+
+    #[test]
+    #[should_panic(expected = "the tensor is not whole rows")]
+    fn part_of_a_row() {
+        scale_shift(Isa::Scalar, &case().args(), &mut [0.0; 11]);
+    }
+
+    #[test]
+    #[should_panic(expected = "the residual has another shape")]
+    fn short_residual() {
+        scale_shift(Isa::Scalar, &case().args(), &mut [0.0; 8]);
+    }
+}
