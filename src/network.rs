@@ -177,7 +177,11 @@ impl Network {
             return bad("classes", self.classes.to_string(), "2 to 256, so that a class fits a byte");
         }
         if self.strides != default_strides() {
-            return bad("strides", format!("{:?}", self.strides), "[8, 16, 32], the strides of the backbone's last three stages");
+            return bad(
+                "strides",
+                format!("{:?}", self.strides),
+                "[8, 16, 32], the strides of the backbone's last three stages",
+            );
         }
         if self.image.iter().any(|v| v % 32 != 0) {
             return bad("image", format!("{:?}", self.image), "height and width padded to multiples of 32");
@@ -190,7 +194,11 @@ impl Network {
         }
         for l in 0..2 {
             if (0..3).any(|a| self.grids[l][a] != 2 * self.grids[l + 1][a]) {
-                return bad("grids", format!("{:?}", self.grids), "each level exactly half of the one before, on every axis");
+                return bad(
+                    "grids",
+                    format!("{:?}", self.grids),
+                    "each level exactly half of the one before, on every axis",
+                );
             }
         }
         for (axis, [lo, hi]) in ["x", "y", "z"].iter().zip(self.bounds) {
