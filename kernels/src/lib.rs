@@ -28,3 +28,5 @@ pub mod window_attention;
 pub use isa::{Isa, IsaError};
 pub use panels::Panels;
 pub use simd::{LANES, relu};
+//! The arithmetic of voxcast.
+pub mod project;
