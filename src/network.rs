@@ -95,9 +95,6 @@ const MAX_DIM: usize = 1 << 16;
 /// Attention heads of the EfficientViT block; fixed by the published architecture.
 pub const HEADS: usize = 8;
 
-/// Largest attention window side.
-pub const WINDOW: usize = 7;
-
 impl Network {
     /// The network of a published configuration, or `None` for a name that is not in [`BUILT_IN`].
     pub fn built_in(name: &str) -> Option<Self> {
@@ -191,6 +188,10 @@ impl Network {
         }
         if let Some(c) = self.channels[1..].iter().find(|&&c| c % HEADS != 0) {
             return bad("channels", c.to_string(), "multiples of 8 at levels 1 to 3, one share per attention head");
+        }
+        if let Some(l) = (0..3).find(|&l| self.key_dims[l] * HEADS != self.channels[l + 1]) {
+            let expected = format!("{} at level {}: a head's output is added to the next one's input, so both have an eighth of the channels", self.channels[l + 1] / HEADS, l + 1);
+            return bad("key_dims", self.key_dims[l].to_string(), &expected);
         }
         for l in 0..2 {
             if (0..3).any(|a| self.grids[l][a] != 2 * self.grids[l + 1][a]) {

@@ -18,6 +18,7 @@ pub mod panels;
 pub mod peak;
 pub mod pool;
 pub mod product;
+pub mod project;
 pub mod scale_shift;
 mod simd;
 #[cfg(test)]
@@ -28,5 +29,3 @@ pub mod window_attention;
 pub use isa::{Isa, IsaError};
 pub use panels::Panels;
 pub use simd::{LANES, relu};
-//! The arithmetic of voxcast.
-pub mod project;

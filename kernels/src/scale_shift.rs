@@ -2,8 +2,9 @@
 //!
 //! ```text
 //! y = x * scale[c] + shift[c]        rounded once
-//! y = y + residual[row][c]           if there is a residual
+//! y = y + residual[row][c]           if there is a residual that comes before the rectifier
 //! y = if y < 0 { 0 } else { y }      if asked for; NaN stays
+//! y = y + residual[row][c]           if there is a residual that comes after it
 //! ```
 //!
 //! The body does sixteen channels at a time.
@@ -18,11 +19,17 @@ pub struct ScaleShift<'a> {
     pub scale: &'a [f32],
     /// One addend per channel, padded likewise.
     pub shift: &'a [f32],
-    /// Channels.
+    /// Channels that are scaled.
     pub channels: usize,
-    /// `[rows, channels]` added after the shift.
+    /// First of them; the others of a row stay.
+    pub first_channel: usize,
+    /// Channels of a row.
+    pub stride: usize,
+    /// `[rows, stride]`, of which the scaled channels are added.
     pub residual: Option<&'a [f32]>,
-    /// Whether negative results become 0, after the residual.
+    /// Whether the residual is added after the rectifier instead of before.
+    pub residual_after: bool,
+    /// Whether negative results become 0.
     pub relu: bool,
 }
 
@@ -32,12 +39,13 @@ impl ScaleShift<'_> {
         assert!(self.channels > 0, "an extent is zero");
         assert_eq!(self.scale.len(), padded, "the scale has another length");
         assert_eq!(self.shift.len(), padded, "the shift has another length");
-        assert!(rows.len().is_multiple_of(self.channels), "the tensor is not whole rows");
+        assert!(self.first_channel + self.channels <= self.stride, "the channels leave the row");
+        assert!(rows.len().is_multiple_of(self.stride), "the tensor is not whole rows");
         assert!(self.residual.is_none_or(|r| r.len() == rows.len()), "the residual has another shape");
     }
 }
 
-/// Replaces `rows`, `[rows, channels]`. To divide rows among threads, divide the residual alike.
+/// Replaces the channels of `rows`, `[rows, stride]`. To divide rows among threads, divide the residual alike.
 ///
 /// # Panics
 /// If a slice does not have the size that the shapes ask for.
@@ -60,27 +68,40 @@ impl Kernel for Run<'_> {
     fn reference(self) {
         let a = self.args;
         for (i, x) in self.rows.iter_mut().enumerate() {
-            let c = i % a.channels;
+            let Some(c) = (i % a.stride).checked_sub(a.first_channel).filter(|&c| c < a.channels) else { continue };
             let mut y = x.mul_add(a.scale[c], a.shift[c]);
-            if let Some(residual) = a.residual {
+            if let Some(residual) = a.residual.filter(|_| !a.residual_after) {
                 y += residual[i];
             }
-            *x = if a.relu { relu(y) } else { y };
+            if a.relu {
+                y = relu(y);
+            }
+            if let Some(residual) = a.residual.filter(|_| a.residual_after) {
+                y += residual[i];
+            }
+            *x = y;
         }
     }
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
         let a = self.args;
-        for (row, x) in self.rows.chunks_exact_mut(a.channels).enumerate() {
-            for (panel, x) in x.chunks_mut(LANES).enumerate() {
+        for (row, x) in self.rows.chunks_exact_mut(a.stride).enumerate() {
+            for (panel, x) in x[a.first_channel..][..a.channels].chunks_mut(LANES).enumerate() {
                 let c = panel * LANES;
                 let mut y = s.mul_add(s.load_part(x), s.load_part(&a.scale[c..]), s.load_part(&a.shift[c..]));
-                if let Some(residual) = a.residual {
-                    y = s.add(y, s.load_part(&residual[row * a.channels + c..][..x.len()]));
+                let residual = a.residual.map(|r| {
+                    let at = row * a.stride + a.first_channel + c;
+                    s.load_part(&r[at..at + x.len()])
+                });
+                if let Some(residual) = residual.filter(|_| !a.residual_after) {
+                    y = s.add(y, residual);
                 }
                 if a.relu {
                     y = s.relu(y);
+                }
+                if let Some(residual) = residual.filter(|_| a.residual_after) {
+                    y = s.add(y, residual);
                 }
                 s.store_part(x, y);
             }
@@ -115,7 +136,16 @@ mod tests {
 
         fn args(&self) -> ScaleShift<'_> {
             let Self { channels, relu, ref scale, ref shift, ref residual, .. } = *self;
-            ScaleShift { scale, shift, channels, residual: residual.as_deref(), relu }
+            ScaleShift {
+                scale,
+                shift,
+                channels,
+                first_channel: 0,
+                stride: channels,
+                residual: residual.as_deref(),
+                residual_after: false,
+                relu,
+            }
         }
 
         fn all(&self, isa: Isa) -> Vec<f32> {

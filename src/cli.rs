@@ -1,0 +1,90 @@
+//! Arguments and commands. One file per command under `cli/`.
+
+mod demo;
+mod dump;
+mod frame;
+mod import;
+mod inspect;
+mod profile;
+mod rig;
+mod run;
+mod terminal;
+
+use clap::{Args, Parser, Subcommand};
+use voxcast::{Error, ErrorKind, Isa, Result, Threads};
+
+/// Camera images to a semantic voxel grid on a CPU, with the same bits every time.
+#[derive(Debug, Parser)]
+#[command(name = "voxcast", version, about, after_help = EXAMPLES)]
+pub struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  voxcast demo -o demo-out
+  voxcast import epoch_24.pth --network nuscenes-200 -o model.safetensors
+  voxcast rig scene/ --model model.safetensors -o rig.safetensors
+  voxcast run --model model.safetensors --rig rig.safetensors scene/ -o out.npz --png out.png
+  voxcast inspect model.safetensors
+
+A scene is a directory with calibration.json and its images, or a .safetensors file with `images` (u8 [N, H, W, 3], BGR)
+and `lidar2img` (f32 [N, 4, 4]).
+
+Exit codes: 0 done, 1 the input or the machine is at fault (one line on stderr), 2 usage.";
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Run a small untrained network on a drawn scene; needs no other file
+    Demo(demo::Demo),
+    /// Turn a training checkpoint into a model
+    Import(import::Import),
+    /// Build the projection matrices of a scene's cameras
+    Rig(rig::BuildRig),
+    /// Run a model on a scene
+    Run(run::Run),
+    /// Say what is in a model or a rig
+    Inspect(inspect::Inspect),
+    /// Time every operation of a model
+    Profile(profile::Profile),
+}
+
+impl Arguments {
+    pub fn run(self) -> Result<()> {
+        match self.command {
+            Command::Demo(command) => command.run(),
+            Command::Import(command) => command.run(),
+            Command::Rig(command) => command.run(),
+            Command::Run(command) => command.run(),
+            Command::Inspect(command) => command.run(),
+            Command::Profile(command) => command.run(),
+        }
+    }
+}
+
+/// How to compute. None of it changes a result.
+#[derive(Args, Debug)]
+pub struct Machine {
+    /// Threads that compute [default: one per CPU]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    threads: Option<u16>,
+    /// Instruction set: scalar, avx2 [default: the fastest of this CPU]
+    #[arg(long, value_name = "NAME")]
+    isa: Option<String>,
+}
+
+impl Machine {
+    pub fn threads(&self) -> Result<Threads> {
+        let count = match self.threads {
+            Some(count) => usize::from(count),
+            None => std::thread::available_parallelism().map_or(1, usize::from),
+        };
+        Threads::new(count)
+    }
+
+    pub fn isa(&self) -> Result<Isa> {
+        let unsupported = |e: voxcast::IsaError| Error::new(ErrorKind::Unsupported, format!("--isa: {e}"));
+        self.isa.as_deref().map_or(Ok(Isa::best()), |name| Isa::parse(name).map_err(unsupported))
+    }
+}

@@ -1,0 +1,41 @@
+//! What `run`, `profile` and `demo` share: model, scene, rig and session from files.
+
+use super::Machine;
+use std::path::Path;
+use std::sync::Arc;
+use voxcast::rig::RigBuilder;
+use voxcast::{Error, Model, Result, Rig, Scene, SessionOptions, Threads};
+
+/// Calibration of a scene directory, of its calibration.json alone, or of a scene file.
+pub fn calibration(path: &Path) -> Result<Vec<[f32; 16]>> {
+    if path.extension().is_some_and(|e| e == "json") {
+        let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, "read", &e))?;
+        let cameras = voxcast::camera::read_calibration(&text).map_err(|e| e.in_file(path))?;
+        return Ok(cameras.into_iter().map(|c| c.lidar2img).collect());
+    }
+    Ok(Scene::open(path)?.lidar2img)
+}
+
+/// The rig from its file, or built from the scene's calibration.
+pub fn rig(path: Option<&Path>, model: &Model, scene: &Scene, threads: &Threads) -> Result<Rig> {
+    match path {
+        Some(path) => Rig::open(path, model.network(), scene.cameras()),
+        None => {
+            let mut builder = RigBuilder::new(model.network(), scene.cameras())?;
+            threads.install(|| builder.build(&scene.lidar2img))
+        }
+    }
+}
+
+/// Opens model and scene, and checks that they belong together.
+pub fn open(model: &Path, scene: &Path) -> Result<(Arc<Model>, Scene)> {
+    let model = Arc::new(Model::open(model)?);
+    let loaded = Scene::open(scene)?;
+    loaded.check(model.network()).map_err(|e| e.in_file(scene))?;
+    Ok((model, loaded))
+}
+
+/// Session options that the machine arguments ask for.
+pub fn options(machine: &Machine) -> Result<SessionOptions> {
+    Ok(SessionOptions { isa: machine.isa()?, threads: machine.threads()?, ..SessionOptions::default() })
+}

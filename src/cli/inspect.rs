@@ -1,0 +1,165 @@
+//! `voxcast inspect`
+
+use super::{Machine, frame, terminal};
+use clap::Args;
+use std::path::PathBuf;
+use voxcast::container::Container;
+use voxcast::{Error, Model, Network, Result, Rig, Session};
+
+/// Say what is in a model or a rig: shapes, precisions, sizes, the memory a session takes, checksum.
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Examples:
+  voxcast inspect model.safetensors
+  voxcast inspect model.safetensors --plan --cameras 1 --threads 4
+  voxcast inspect rig.safetensors --json")]
+pub struct Inspect {
+    /// A model or a rig
+    file: PathBuf,
+    /// Cameras that the session is sized for [default: as the network says]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=64))]
+    cameras: Option<u16>,
+    /// Also print every operation
+    #[arg(long)]
+    operations: bool,
+    /// Also print where every tensor lies in the arena
+    #[arg(long)]
+    plan: bool,
+    /// Also print every stored tensor
+    #[arg(long)]
+    tensors: bool,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    machine: Machine,
+}
+
+impl Inspect {
+    pub fn run(self) -> Result<()> {
+        let container = Container::open(&self.file)?;
+        let format = container.metadata().get("format").cloned().unwrap_or_default();
+        let is_rig = format.starts_with("voxcast-rig") || container.tensor("level1.volume.ptr").is_some();
+        if is_rig { self.rig(&container) } else { self.model() }
+    }
+
+    fn model(&self) -> Result<()> {
+        let model = Model::open(&self.file)?;
+        let network = model.network();
+        let options = frame::options(&self.machine)?;
+        let cameras = self.cameras.map_or(network.cameras, usize::from);
+        let graph = model.graph(false, false);
+        let memory = Session::memory(&model, cameras, &options)?;
+        let parameters: usize = model.tensors().map(|(_, _, len)| len).sum();
+        let multiply_adds: u64 = (0..graph.operations.len())
+            .map(|i| graph.multiply_adds(&graph.operations[i]) * if i < graph.camera_operations { cameras as u64 } else { 1 })
+            .sum();
+        let rewrites = model.options().rewrites;
+        if self.json {
+            let value = serde_json::json!({
+                "kind": "model",
+                "network": network,
+                "precision": model.options().precision.name(),
+                "batch_norm_folded": rewrites.batch_norm,
+                "projection_folded": rewrites.projection,
+                "stored_numbers": parameters,
+                "file_bytes": model.file_size(),
+                "checksum": model.checksum().map(|c| format!("{c:016x}")),
+                "cameras": cameras,
+                "threads": options.threads.count(),
+                "arena_bytes": memory.arena,
+                "output_bytes": memory.output,
+                "session_bytes": memory.total(),
+                "multiply_adds": multiply_adds,
+            });
+            println!("{value:#}");
+            return Ok(());
+        }
+        let [x, y, z] = network.output_grid();
+        println!("model      {}", self.file.display());
+        println!("checksum   {:016x}", model.checksum().unwrap_or_default());
+        println!(
+            "weights    {} numbers, {} (batch norms {}, projection {})",
+            parameters,
+            model.options().precision.name(),
+            if rewrites.batch_norm { "folded" } else { "kept" },
+            if rewrites.projection { "folded" } else { "kept" }
+        );
+        println!("file       {}", terminal::bytes(model.file_size()));
+        println!("images     {} x {} (height x width, padded)", network.image[0], network.image[1]);
+        println!("output     {x} x {y} x {z} voxels, {} classes", network.classes);
+        println!("work       {:.1} GMAC a frame of {cameras} cameras", multiply_adds as f64 / 1e9);
+        println!(
+            "session    {} bytes for {cameras} cameras and {} threads: arena {}, output {}",
+            memory.total(),
+            options.threads.count(),
+            memory.arena,
+            memory.output
+        );
+        println!("network    {}", network.to_json());
+        if self.operations {
+            for (i, operation) in graph.operations.iter().enumerate() {
+                let tensor = graph.tensor(operation.output);
+                println!(
+                    "{:>4} {:60} {:?} x {:<5} {:>8.3} GMAC{}",
+                    i,
+                    operation.name,
+                    tensor.extent,
+                    tensor.channels,
+                    graph.multiply_adds(operation) as f64 / 1e9,
+                    if i < graph.camera_operations { " per camera" } else { "" }
+                );
+            }
+        }
+        if self.plan {
+            print!("{}", voxcast::plan::Plan::new(&graph, cameras, options.threads.count())?);
+        }
+        if self.tensors {
+            for (name, dtype, len) in model.tensors() {
+                println!("{name:70} {dtype:?} {len}");
+            }
+        }
+        Ok(())
+    }
+
+    fn rig(&self, container: &Container) -> Result<()> {
+        let network = container.metadata().get("network").ok_or_else(|| {
+            Error::format("a plain rig names no network; `voxcast run` checks it against the model").in_file(&self.file)
+        })?;
+        let network = Network::from_json(network).map_err(|e| e.in_file(&self.file))?;
+        let cameras = container.metadata().get("cameras").and_then(|c| c.parse().ok()).unwrap_or(network.cameras);
+        let rig = Rig::open(&self.file, &network, cameras)?;
+        let levels: Vec<_> = (0..3).map(|i| rig.level(i)).collect();
+        if self.json {
+            let value = serde_json::json!({
+                "kind": "rig",
+                "cameras": rig.cameras(),
+                "file_bytes": container.bytes().len(),
+                "checksum": container.checksum().map(|c| format!("{c:016x}")),
+                "levels": levels.iter().map(|l| serde_json::json!({
+                    "volume": {"rows": l.volume.ptr.len() - 1, "entries": l.volume.col.len()},
+                    "bev": {"rows": l.bev.ptr.len() - 1, "entries": l.bev.col.len()},
+                })).collect::<Vec<_>>(),
+            });
+            println!("{value:#}");
+            return Ok(());
+        }
+        println!("rig        {}", self.file.display());
+        println!("checksum   {:016x}", container.checksum().unwrap_or_default());
+        println!("file       {}", terminal::bytes(container.bytes().len()));
+        println!("cameras    {}", rig.cameras());
+        for (i, level) in levels.iter().enumerate() {
+            for (name, matrix) in [("volume", level.volume), ("bev", level.bev)] {
+                let empty = matrix.ptr.windows(2).filter(|w| w[0] == w[1]).count();
+                println!(
+                    "level {}    {name:6} {} rows, {} empty, {} entries",
+                    i + 1,
+                    matrix.ptr.len() - 1,
+                    empty,
+                    matrix.col.len()
+                );
+            }
+        }
+        Ok(())
+    }
+}

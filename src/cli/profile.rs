@@ -1,0 +1,228 @@
+//! `voxcast profile`
+
+use super::{Machine, frame, terminal};
+use clap::Args;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use voxcast::graph::{Graph, Op};
+use voxcast::session::views;
+use voxcast::{Error, Isa, Result, Session, Threads};
+
+/// Time every operation of a model on a scene: median, multiply-adds per second, and the share of this machine's own
+/// peak, which is measured between the frames.
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Examples:
+  voxcast profile --model model.safetensors scene/
+  voxcast profile --model model.safetensors scene/ --repeat 5 --by kind
+  voxcast profile --model model.safetensors scene/ --trace trace.json    (open in chrome://tracing or Perfetto)")]
+pub struct Profile {
+    /// The model
+    #[arg(long)]
+    model: PathBuf,
+    /// The scene's matrices, made by `voxcast rig`
+    #[arg(long)]
+    rig: Option<PathBuf>,
+    /// A scene directory or .safetensors
+    scene: PathBuf,
+    /// Frames to time, after one that is not
+    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u16).range(1..=1000))]
+    repeat: u16,
+    /// Rows of the table: every operation, or sums over part of the network or kind of operation
+    #[arg(long, default_value = "operation", value_parser = ["operation", "part", "kind"])]
+    by: String,
+    /// Run without the projection fold
+    #[arg(long)]
+    unfolded: bool,
+    /// Write the last frame as a Chrome trace
+    #[arg(long, value_name = "FILE")]
+    trace: Option<PathBuf>,
+    /// Print as JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    machine: Machine,
+}
+
+/// Seconds of one operation in each frame, all cameras together.
+struct Row {
+    name: String,
+    seconds: Vec<f64>,
+    multiply_adds: u64,
+}
+
+impl Profile {
+    pub fn run(self) -> Result<()> {
+        let (model, scene) = frame::open(&self.model, &self.scene)?;
+        let mut options = frame::options(&self.machine)?;
+        options.unfolded = self.unfolded;
+        let rig = Arc::new(frame::rig(self.rig.as_deref(), &model, &scene, &options.threads)?);
+        let mut session = Session::new(model, rig, &options)?;
+        let graph = session.graph().clone();
+        let images = views(&scene);
+        let index_of: std::collections::BTreeMap<&str, usize> =
+            graph.operations.iter().enumerate().map(|(i, o)| (o.name.as_str(), i)).collect();
+        let repeat = usize::from(self.repeat);
+        let mut seconds = vec![vec![0.0f64; repeat + 1]; graph.operations.len()];
+        let mut peaks = vec![];
+        let mut frames = vec![];
+        let mut trace = vec![];
+        let bar = terminal::progress("profiling", repeat + 1);
+        for round in 0..=repeat {
+            peaks.push(peak(options.isa, &options.threads));
+            trace.clear();
+            let start = Instant::now();
+            session.run_observed(&images, &mut |event| {
+                let index = index_of[event.operation.name.as_str()];
+                seconds[index][round] += event.elapsed.as_secs_f64();
+                trace.push((index, event.camera, start.elapsed(), event.elapsed));
+            })?;
+            frames.push(start.elapsed().as_secs_f64());
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        if let Some(path) = &self.trace {
+            write_trace(path, &graph, &trace)?;
+        }
+        let peak = median(&mut peaks[1..]);
+        let frame = median(&mut frames[1..]);
+        let rows = self.rows(&graph, &seconds, images.len());
+        self.print(rows, frame, peak, options.threads.count());
+        Ok(())
+    }
+
+    /// Table rows in running order.
+    fn rows(&self, graph: &Graph, seconds: &[Vec<f64>], cameras: usize) -> Vec<Row> {
+        let mut rows: Vec<Row> = vec![];
+        for (i, operation) in graph.operations.iter().enumerate() {
+            let name = match self.by.as_str() {
+                "kind" => kind(&operation.op).to_owned(),
+                "part" => part(&operation.name),
+                _ => operation.name.clone(),
+            };
+            let times = if i < graph.camera_operations { cameras as u64 } else { 1 };
+            let work = graph.multiply_adds(operation) * times;
+            match rows.iter_mut().find(|r| r.name == name) {
+                Some(row) => {
+                    row.multiply_adds += work;
+                    row.seconds.iter_mut().zip(&seconds[i][1..]).for_each(|(sum, s)| *sum += s);
+                }
+                None => rows.push(Row { name, seconds: seconds[i][1..].to_vec(), multiply_adds: work }),
+            }
+        }
+        rows
+    }
+
+    fn print(&self, rows: Vec<Row>, frame: f64, peak: f64, threads: usize) {
+        let rows: Vec<_> = rows.into_iter().map(|mut r| (r.name, median(&mut r.seconds), r.multiply_adds)).collect();
+        let total: u64 = rows.iter().map(|r| r.2).sum();
+        if self.json {
+            let rows: Vec<_> = rows
+                .iter()
+                .map(|(name, s, work)| serde_json::json!({"name": name, "seconds": s, "multiply_adds": work}))
+                .collect();
+            let value = serde_json::json!({
+                "frame_seconds": frame, "peak_multiply_adds_per_second": peak, "threads": threads,
+                "multiply_adds": total, "rows": rows,
+            });
+            println!("{value:#}");
+            return;
+        }
+        println!("{:58} {:>10} {:>6} {:>9} {:>9} {:>6}", self.by, "median", "share", "GMAC", "GMAC/s", "peak");
+        for (name, s, work) in &rows {
+            let rate = *work as f64 / s;
+            let (gmac, rate, share) = if *work == 0 {
+                (String::new(), String::new(), String::new())
+            } else {
+                let gmac = format!("{:.3}", *work as f64 / 1e9);
+                (gmac, format!("{:.1}", rate / 1e9), format!("{:.0} %", 100.0 * rate / peak))
+            };
+            println!(
+                "{name:58} {:>10} {:>5.1}% {gmac:>9} {rate:>9} {share:>6}",
+                terminal::time(Duration::from_secs_f64(*s)),
+                100.0 * s / frame
+            );
+        }
+        println!(
+            "frame {} on {threads} threads, {:.1} GMAC, {:.1} GMAC/s, {:.0} % of the measured peak of {:.1} GMAC/s",
+            terminal::time(Duration::from_secs_f64(frame)),
+            total as f64 / 1e9,
+            total as f64 / frame / 1e9,
+            100.0 * total as f64 / frame / peak,
+            peak / 1e9
+        );
+    }
+}
+
+/// Multiply-adds per second of all threads together, register to register.
+fn peak(isa: Isa, threads: &Threads) -> f64 {
+    let rounds = if isa == Isa::Scalar { 200_000 } else { 4_000_000 };
+    let start = Instant::now();
+    let work: u64 = threads.broadcast(|| voxcast_kernels::peak::multiply_adds(isa, rounds).0).into_iter().sum();
+    work as f64 / start.elapsed().as_secs_f64()
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+fn kind(op: &Op) -> &'static str {
+    match op {
+        Op::Normalise => "normalise",
+        Op::Conv { geometry } if geometry.kernel == [1; 3] => "conv 1x1",
+        Op::Conv { geometry } if geometry.kernel[0] == 1 => "conv2d",
+        Op::Conv { .. } => "conv3d",
+        Op::DeformConv { .. } => "deform_conv2d",
+        Op::Depthwise { .. } => "depthwise",
+        Op::BatchNorm => "scale_shift",
+        Op::MaxPool { .. } => "max_pool",
+        Op::UpsampleAdd => "upsample_add",
+        Op::Gather { .. } => "gather",
+        Op::Deconv => "deconv3d",
+        Op::WindowAttention { .. } => "window_attention",
+        Op::Gate => "gate",
+        Op::GlobalMean | Op::Broadcast => "pool",
+        Op::Head { .. } => "head",
+    }
+}
+
+/// The part of the network that an operation belongs to: backbone stage, pyramid, level, refinement, head.
+fn part(name: &str) -> String {
+    let mut words = name.split('.');
+    match (words.next(), words.next(), words.next()) {
+        (Some("img_backbone"), Some(stage), _) if stage.starts_with("layer") => format!("backbone {stage}"),
+        (Some("image" | "img_backbone"), ..) => "backbone stem".to_owned(),
+        (Some("img_neck"), ..) => "pyramid".to_owned(),
+        (Some("view_transformer"), Some("imvts"), Some(level)) => {
+            let level = level.parse().map_or(0, |l: usize| l + 1);
+            let branch = match name {
+                n if n.contains(".gather.") => "gather",
+                n if n.contains("conv3d") || n.contains("combine") => "volume",
+                _ => "bev",
+            };
+            format!("level {level} {branch}")
+        }
+        (Some("view_transformer"), Some(part), _) => part.to_owned(),
+        _ => "head".to_owned(),
+    }
+}
+
+/// Chrome's trace event format: one complete event per operation, one row per camera.
+fn write_trace(path: &Path, graph: &Graph, trace: &[(usize, Option<usize>, Duration, Duration)]) -> Result<()> {
+    let events: Vec<_> = trace
+        .iter()
+        .map(|(index, camera, end, elapsed)| {
+            let operation = &graph.operations[*index];
+            serde_json::json!({
+                "name": operation.name, "cat": kind(&operation.op), "ph": "X", "pid": 0,
+                "tid": camera.map_or("frame".to_owned(), |c| format!("camera {c}")),
+                "ts": end.saturating_sub(*elapsed).as_secs_f64() * 1e6, "dur": elapsed.as_secs_f64() * 1e6,
+                "args": {"multiply_adds": graph.multiply_adds(operation)},
+            })
+        })
+        .collect();
+    let text = serde_json::json!({"traceEvents": events}).to_string();
+    std::fs::write(path, text).map_err(|e| Error::io(path, "write", &e))
+}

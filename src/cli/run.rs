@@ -1,0 +1,181 @@
+//! `voxcast run`
+
+use super::dump::Dump;
+use super::{Machine, frame, terminal};
+use clap::Args;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use voxcast::npz::{Array, Elements, write_npz};
+use voxcast::picture::{self, Figure, Palette};
+use voxcast::scene::forward_of;
+use voxcast::session::{Occupancy, views};
+use voxcast::{Network, Result, Scene, Session};
+
+/// Run a model on a scene and write the class of every voxel.
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Examples:
+  voxcast run --model model.safetensors scene/ -o out.npz
+  voxcast run --model model.safetensors --rig rig.safetensors scene/ -o out.npz --logits --png out.png
+  voxcast run --model model.safetensors scene/ -o out.npz --dump stages/ --stages level1.volume,logits.lvl0
+
+In Python: numpy.load('out.npz')['classes'] is u8 [X, Y, Z].
+Without --rig the matrices are built from the scene's calibration, as part of the frame.")]
+pub struct Run {
+    /// The model
+    #[arg(long)]
+    model: PathBuf,
+    /// The scene's matrices, made by `voxcast rig`
+    #[arg(long)]
+    rig: Option<PathBuf>,
+    /// A scene directory or .safetensors
+    scene: PathBuf,
+    /// The .npz to write: `classes` u8 [X, Y, Z]
+    #[arg(short, long, value_name = "OUT.npz")]
+    output: PathBuf,
+    /// Also write `logits` f32 [X, Y, Z, K]
+    #[arg(long)]
+    logits: bool,
+    /// Draw images, bird's-eye view and voxels
+    #[arg(long, value_name = "FILE")]
+    png: Option<PathBuf>,
+    /// Write stages of the network to DIR/stages.safetensors, channels first
+    #[arg(long, value_name = "DIR")]
+    dump: Option<PathBuf>,
+    /// Which stages to dump, separated by commas [default: all, which runs without the projection fold]
+    #[arg(long, value_name = "NAMES", requires = "dump")]
+    stages: Option<String>,
+    /// Run without the projection fold
+    #[arg(long)]
+    unfolded: bool,
+    /// Print the summary as JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    machine: Machine,
+}
+
+impl Run {
+    pub fn run(self) -> Result<()> {
+        let start = Instant::now();
+        let (model, scene) = frame::open(&self.model, &self.scene)?;
+        let mut dump = self.dump.as_ref().map(|_| Dump::new(self.stages.as_deref(), model.network())).transpose()?;
+        let mut options = frame::options(&self.machine)?;
+        options.logits = self.logits;
+        options.unfolded = self.unfolded || dump.as_ref().is_some_and(|d| d.needs_unfolded(model.network()));
+        options.coarse_heads = dump.as_ref().is_some_and(Dump::needs_coarse_heads);
+        options.logits |= dump.as_ref().is_some_and(|d| d.wants("logits.lvl0"));
+        let loaded = start.elapsed();
+
+        let start = Instant::now();
+        let rig = Arc::new(frame::rig(self.rig.as_deref(), &model, &scene, &options.threads)?);
+        let rig_time = start.elapsed();
+        let mut session = Session::new(model.clone(), rig.clone(), &options)?;
+
+        let graph = session.graph().clone();
+        let total = graph.camera_operations * scene.cameras() + graph.operations.len() - graph.camera_operations;
+        let bar = terminal::progress("running", total);
+        let start = Instant::now();
+        let mut dumping = Duration::ZERO;
+        let result = session.run_observed(&views(&scene), &mut |event| {
+            bar.inc(1);
+            if let Some(dump) = &mut dump {
+                let start = Instant::now();
+                dump.observe(&graph, &event);
+                dumping += start.elapsed();
+            }
+        })?;
+        let frame_time = start.elapsed() - dumping;
+        bar.finish_and_clear();
+
+        let network = model.network();
+        write(&self.output, network, &result, self.logits)?;
+        if let Some(path) = &self.png {
+            draw(network, &scene, &result, &title(&self.model), "")?.write_png(path)?;
+        }
+        if let (Some(dump), Some(directory)) = (dump, &self.dump) {
+            dump.finish(directory, &rig, result.grid, result.classes)?;
+        }
+        let summary = Summary { loaded, rig_time, mapped: self.rig.is_some(), frame_time };
+        summary.print(network, &result, self.json);
+        Ok(())
+    }
+}
+
+/// A model's file name without its ending.
+fn title(model: &Path) -> String {
+    model.file_stem().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+/// Writes the result as a `.npz`.
+pub fn write(path: &Path, network: &Network, result: &Occupancy<'_>, logits: bool) -> Result<()> {
+    let [x, y, z] = result.grid;
+    let shape = [x, y, z, network.classes];
+    let mut arrays = vec![Array { name: "classes", shape: &shape[..3], elements: Elements::U8(result.classes) }];
+    if let Some(values) = result.logits.filter(|_| logits) {
+        arrays.push(Array { name: "logits", shape: &shape, elements: Elements::F32(values) });
+    }
+    write_npz(path, &arrays)
+}
+
+/// The picture of a result.
+pub fn draw(
+    network: &Network,
+    scene: &Scene,
+    result: &Occupancy<'_>,
+    title: &str,
+    subtitle: &str,
+) -> Result<picture::Picture> {
+    let palette = Palette::of(network.classes);
+    let occupancy = picture::Occupancy::new("occupancy", result.classes, result.grid, network.bounds, forward_of(&network.bounds))?;
+    let images: Vec<_> = scene.names.iter().map(String::as_str).zip(&scene.images).collect();
+    Ok(picture::draw(&Figure { title, subtitle, images: &images, occupancies: &[occupancy], palette: &palette }))
+}
+
+struct Summary {
+    loaded: Duration,
+    rig_time: Duration,
+    mapped: bool,
+    frame_time: Duration,
+}
+
+impl Summary {
+    fn print(&self, network: &Network, result: &Occupancy<'_>, json: bool) {
+        let mut counts = vec![0usize; network.classes];
+        result.classes.iter().for_each(|&class| counts[usize::from(class)] += 1);
+        let digest = digest(result);
+        if json {
+            let value = serde_json::json!({
+                "grid": result.grid,
+                "counts": counts,
+                "digest": digest,
+                "seconds": {
+                    "load": self.loaded.as_secs_f64(),
+                    "rig": self.rig_time.as_secs_f64(),
+                    "frame": self.frame_time.as_secs_f64(),
+                },
+            });
+            println!("{value}");
+            return;
+        }
+        let [x, y, z] = result.grid;
+        let occupied = result.classes.len() - counts[0];
+        println!(
+            "{x}x{y}x{z} voxels, {occupied} occupied ({:.1} %), digest {digest}",
+            100.0 * occupied as f64 / result.classes.len() as f64
+        );
+        println!(
+            "load {}, {} rig {}, frame {}",
+            terminal::time(self.loaded),
+            if self.mapped { "map" } else { "build" },
+            terminal::time(self.rig_time),
+            terminal::time(self.frame_time)
+        );
+    }
+}
+
+/// XXH3-64 of the classes, by which two results are compared at a glance.
+pub fn digest(result: &Occupancy<'_>) -> String {
+    format!("{:016x}", xxhash_rust::xxh3::xxh3_64(result.classes))
+}
