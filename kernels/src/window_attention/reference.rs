@@ -17,7 +17,7 @@ impl WindowAttention<'_> {
                 let x = self.position(rows, window, t).map_or(0.0, |[row, column]| {
                     self.input[((rows.start + row) * extent[1] + column) * channels + head * part + i]
                 });
-                scratch.feature[t * part + i] = if head == 0 { x } else { x + scratch.head[t * key_dim + i] };
+                scratch.window[t * part + i] = if head == 0 { x } else { x + scratch.head[t * key_dim + i] };
             }
         }
         let weights = &self.qkv[head * packed_len(part, 3 * key_dim)..];
@@ -25,7 +25,7 @@ impl WindowAttention<'_> {
             for n in 0..3 * key_dim {
                 let mut sum = self.qkv_bias[head * (3 * key_dim).next_multiple_of(LANES) + n];
                 for i in 0..part {
-                    sum = scratch.feature[t * part + i].mul_add(weights[packed_index(part, i, n)], sum);
+                    sum = scratch.window[t * part + i].mul_add(weights[packed_index(part, i, n)], sum);
                 }
                 scratch.qkv[t * 3 * key_dim + n] = sum;
             }
