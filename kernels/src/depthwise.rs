@@ -8,7 +8,7 @@
 //! Stride 1, zero padding k/2, so the output has the shape of the input. The sum is one chain of fused multiply-adds
 //! that starts at the bias; taps outside count as in = 0 and stay in the chain; the residual joins last.
 //!
-//! The body runs sixteen channels at a time and, where no tap leaves the row, [`BLOCK`] neighbouring columns, which
+//! The body runs sixteen channels at a time and, where no tap leaves the row, four neighbouring columns, which
 //! share each load of weights. Neither touches the order of a chain.
 
 use crate::isa::Isa;

@@ -44,7 +44,7 @@ pub const SIDE: usize = 7;
 /// Side of the depthwise kernel on q.
 pub const QUERY_KERNEL: usize = 5;
 
-/// The sizes of an attention.
+/// The sizes of an attention, none of them 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shape {
     /// Extent of the plane, first axis first.
@@ -223,22 +223,6 @@ struct Run<'a> {
 }
 
 impl WindowAttention<'_> {
-    /// The token's position in the plane as (row within the call's rows, column), or `None` if it is padding.
-    #[inline(always)]
-    fn position(&self, rows: &Range<usize>, window: usize, token: usize) -> Option<[usize; 2]> {
-        let [_, width] = self.shape.window();
-        let at = [token / width, window * width + token % width];
-        (at[0] < rows.len() && at[1] < self.shape.extent[1]).then_some(at)
-    }
-
-    /// The offset between two tokens in head `head`.
-    #[inline(always)]
-    fn offset(&self, head: usize, t: usize, u: usize) -> f32 {
-        let (side, [_, width]) = (self.shape.side(), self.shape.window());
-        let (dx, dy) = ((t / width).abs_diff(u / width), (t % width).abs_diff(u % width));
-        self.offsets[head * side * side + dx * side + dy]
-    }
-
     /// The factor of the scores. Square root and division are correctly rounded everywhere.
     #[inline(always)]
     fn scale(&self) -> f32 {
@@ -276,7 +260,7 @@ impl Kernel for Run<'_> {
     }
 }
 
-/// The largest of 16 lanes by the tree of [`tree_sum`]; the earlier one where the comparison is false.
+/// The largest of 16 lanes by the tree of the sum; the earlier one where the comparison is false.
 #[inline(always)]
 fn tree_max(mut x: [f32; LANES]) -> f32 {
     for half in [8, 4, 2, 1] {

@@ -56,7 +56,8 @@ impl WindowAttention<'_> {
         let weights = packed_len(part, 3 * key_dim);
         let weights = &self.qkv[head * weights..(head + 1) * weights];
         let bias = &self.qkv_bias[head * columns..(head + 1) * columns];
-        product(s, &scratch.window[head * part..], channels, weights, Some(bias), scratch.qkv, columns);
+        let a = Rows { values: &scratch.window[head * part..], stride: channels };
+        product(s, a, weights, Some(bias), scratch.qkv, columns);
 
         let (keys, values) = scratch.packed.split_at_mut(packed_len(key_dim, tokens));
         for (t, qkv) in scratch.qkv.chunks_exact(columns).enumerate() {
@@ -82,12 +83,12 @@ impl WindowAttention<'_> {
         let tokens = self.shape.tokens();
         let (pad, padded) = (key_dim.next_multiple_of(LANES), tokens.next_multiple_of(LANES));
         let (keys, values) = scratch.packed.split_at(packed_len(key_dim, tokens));
-        product(s, scratch.query, pad, keys, None, scratch.scores, padded);
+        product(s, Rows { values: scratch.query, stride: pad }, keys, None, scratch.scores, padded);
         let offsets = &scratch.offsets[head * tokens * padded..(head + 1) * tokens * padded];
         for (scores, offsets) in scratch.scores.chunks_exact_mut(padded).zip(offsets.chunks_exact(padded)) {
             softmax(s, scores, offsets, tokens, self.scale());
         }
-        product(s, scratch.scores, padded, values, None, scratch.head, pad);
+        product(s, Rows { values: scratch.scores, stride: padded }, values, None, scratch.head, pad);
         for (t, out) in scratch.head.chunks_exact(pad).enumerate() {
             let all = &mut scratch.heads[(t * heads + head) * key_dim..][..key_dim];
             for (all, x) in all.iter_mut().zip(out) {
@@ -114,7 +115,8 @@ impl WindowAttention<'_> {
     ) {
         let Shape { extent, channels, heads, key_dim, .. } = self.shape;
         let (columns, width) = (channels.next_multiple_of(LANES), self.shape.window()[1]);
-        product(s, scratch.heads, heads * key_dim, self.proj, Some(self.proj_bias), scratch.proj, columns);
+        let a = Rows { values: scratch.heads, stride: heads * key_dim };
+        product(s, a, self.proj, Some(self.proj_bias), scratch.proj, columns);
         for (t, y) in scratch.proj.chunks_exact(columns).enumerate() {
             let (row, column) = (t / width, window * width + t % width);
             if row >= rows.len() || column >= extent[1] {
@@ -227,39 +229,32 @@ fn softmax<S: Simd>(s: S, scores: &mut [f32], offsets: &[f32], tokens: usize, sc
     }
 }
 
+/// The left matrix of a [`product`]: rows `stride` apart, the first one at the start of `values`.
+#[derive(Clone, Copy)]
+struct Rows<'a> {
+    values: &'a [f32],
+    stride: usize,
+}
+
 /// `out[r][n] = bias[n] + a[r][0] * w[0][n] + a[r][1] * w[1][n] + ...`, one chain, for all columns of the packed panels.
 ///
-/// The rows of `a` are `stride` apart and may be longer than the depth. A row of `out` has `columns` numbers, a multiple
-/// of 16; `weights` are `columns / 16` panels, which gives the depth. Without a bias the chain starts at 0.
+/// A row of `out` has `columns` numbers, a multiple of 16; `weights` are `columns / 16` panels, which gives the depth, and
+/// rows of `a` may go on beyond it. Without a bias the chain starts at 0.
 #[inline(always)]
-fn product<S: Simd>(
-    s: S,
-    a: &[f32],
-    stride: usize,
-    weights: &[f32],
-    bias: Option<&[f32]>,
-    out: &mut [f32],
-    columns: usize,
-) {
+fn product<S: Simd>(s: S, a: Rows<'_>, weights: &[f32], bias: Option<&[f32]>, out: &mut [f32], columns: usize) {
     let (panel_len, rows) = (weights.len() / columns * LANES, out.len() / columns);
     for (i, panel) in weights.chunks_exact(panel_len).enumerate() {
-        let (panel, _) = panel.as_chunks::<LANES>();
+        let (panel, _) = panel.as_chunks();
         let start = s.load(bias.map_or(&[0.0; LANES], |bias| lanes(&bias[i * LANES..])));
         let mut r = 0;
         while r < rows {
+            let a = Rows { values: &a.values[r * a.stride..], ..a };
+            let out = &mut out[r * columns + i * LANES..];
             if r + TILE <= rows {
-                tile::<S, TILE>(
-                    s,
-                    &a[r * stride..],
-                    stride,
-                    panel,
-                    start,
-                    &mut out[r * columns + i * LANES..],
-                    columns,
-                );
+                tile::<S, TILE>(s, a, panel, start, out, columns);
                 r += TILE;
             } else {
-                tile::<S, 1>(s, &a[r * stride..], stride, panel, start, &mut out[r * columns + i * LANES..], columns);
+                tile::<S, 1>(s, a, panel, start, out, columns);
                 r += 1;
             }
         }
@@ -270,14 +265,13 @@ fn product<S: Simd>(
 #[inline(always)]
 fn tile<S: Simd, const R: usize>(
     s: S,
-    a: &[f32],
-    stride: usize,
+    a: Rows<'_>,
     panel: &[[f32; LANES]],
     start: S::V,
     out: &mut [f32],
     columns: usize,
 ) {
-    let rows: [&[f32]; R] = std::array::from_fn(|r| &a[r * stride..][..panel.len()]);
+    let rows: [&[f32]; R] = std::array::from_fn(|r| &a.values[r * a.stride..][..panel.len()]);
     let mut sums = [start; R];
     for (k, w) in panel.iter().enumerate() {
         let w = s.load(w);

@@ -7,6 +7,20 @@ use crate::simd::{LANES, relu, tree_sum};
 use std::ops::Range;
 
 impl WindowAttention<'_> {
+    /// The token's position in the plane as (row within the call's rows, column), or `None` if it is padding.
+    fn position(&self, rows: &Range<usize>, window: usize, token: usize) -> Option<[usize; 2]> {
+        let [_, width] = self.shape.window();
+        let at = [token / width, window * width + token % width];
+        (at[0] < rows.len() && at[1] < self.shape.extent[1]).then_some(at)
+    }
+
+    /// The offset between two tokens in head `head`.
+    fn offset(&self, head: usize, t: usize, u: usize) -> f32 {
+        let (side, [_, width]) = (self.shape.side(), self.shape.window());
+        let (dx, dy) = ((t / width).abs_diff(u / width), (t % width).abs_diff(u % width));
+        self.offsets[head * side * side + dx * side + dy]
+    }
+
     /// One head of one window.
     pub(super) fn reference_head(&self, rows: &Range<usize>, window: usize, head: usize, scratch: &mut Scratch<'_>) {
         let Shape { extent, channels, heads, key_dim, .. } = self.shape;
