@@ -8,7 +8,7 @@
 //! Stride 1, zero padding k/2, so the output has the shape of the input. The sum is one chain of fused multiply-adds
 //! that starts at the bias; taps outside count as in = 0 and stay in the chain; the residual joins last.
 //!
-//! The body runs sixteen channels at a time and, where no tap leaves the row, [`BLOCK`] neighbouring columns, which
+//! The body runs sixteen channels at a time and, where no tap leaves the row, four neighbouring columns, which
 //! share each load of weights. Neither touches the order of a chain.
 
 use crate::isa::Isa;
@@ -65,10 +65,10 @@ pub fn depthwise(isa: Isa, args: &Depthwise<'_>, rows: Range<usize>, out: &mut [
 }
 
 /// One call whose arguments fit together.
-pub(crate) struct Run<'a> {
-    pub(crate) args: &'a Depthwise<'a>,
-    pub(crate) rows: Range<usize>,
-    pub(crate) out: &'a mut [f32],
+struct Run<'a> {
+    args: &'a Depthwise<'a>,
+    rows: Range<usize>,
+    out: &'a mut [f32],
 }
 
 impl Kernel for Run<'_> {
@@ -125,36 +125,49 @@ impl Depthwise<'_> {
     /// All channels of the `N` columns from `x` on in row `y`. For N > 1 no tap may leave the row.
     #[inline(always)]
     fn columns<S: Simd, const N: usize>(&self, s: S, y: usize, x: usize, out: &mut [f32]) {
+        let whole = self.channels / LANES * LANES;
+        for c in (0..whole).step_by(LANES) {
+            self.tile::<S, N, true>(s, [y, x, c], out);
+        }
+        if whole < self.channels {
+            self.tile::<S, N, false>(s, [y, x, whole], out);
+        }
+    }
+
+    /// Up to 16 channels of [`Self::columns`], from `c` on; all 16 if `WHOLE`, which spares the accumulators the call
+    /// that a part of a vector takes.
+    #[inline(always)]
+    fn tile<S: Simd, const N: usize, const WHOLE: bool>(&self, s: S, [y, x, c]: [usize; 3], out: &mut [f32]) {
         let padded = self.channels.next_multiple_of(LANES);
-        for c in (0..self.channels).step_by(LANES) {
-            let lanes = LANES.min(self.channels - c);
-            let mut sum = [s.load_part(&self.bias[c..]); N];
-            for ky in 0..self.kernel {
-                for kx in 0..self.kernel {
-                    let w = s.load_part(&self.weights[(ky * self.kernel + kx) * padded + c..]);
-                    match self.offset(y + ky, x + kx) {
-                        Some(at) => {
-                            for (i, sum) in sum.iter_mut().enumerate() {
-                                let input = s.load_part(&self.input[at + i * self.channels + c..][..lanes]);
-                                *sum = s.mul_add(input, w, *sum);
-                            }
+        let lanes = if WHOLE { LANES } else { self.channels - c };
+        let load = |at: usize| {
+            let x = &self.input[at..at + lanes];
+            if WHOLE { s.load(x.first_chunk().expect("16 channels")) } else { s.load_part(x) }
+        };
+        let mut sums = [s.load(self.bias[c..].first_chunk().expect("padded channels")); N];
+        for ky in 0..self.kernel {
+            for kx in 0..self.kernel {
+                let w = &self.weights[(ky * self.kernel + kx) * padded + c..];
+                let w = s.load(w.first_chunk().expect("padded channels"));
+                match self.offset(y + ky, x + kx) {
+                    Some(at) => {
+                        for (i, sum) in sums.iter_mut().enumerate() {
+                            *sum = s.mul_add(load(at + i * self.channels + c), w, *sum);
                         }
-                        None => {
-                            for sum in &mut sum {
-                                *sum = s.mul_add(s.splat(0.0), w, *sum);
-                            }
+                    }
+                    None => {
+                        for sum in &mut sums {
+                            *sum = s.mul_add(s.splat(0.0), w, *sum);
                         }
                     }
                 }
             }
-            for (i, &sum) in sum.iter().enumerate() {
-                let mut sum = sum;
-                if self.residual {
-                    let at = ((y * self.width + x) + i) * self.channels + c;
-                    sum = s.add(sum, s.load_part(&self.input[at..][..lanes]));
-                }
-                s.store_part(&mut out[i * self.channels + c..][..lanes], sum);
+        }
+        for (i, mut sum) in sums.into_iter().enumerate() {
+            if self.residual {
+                sum = s.add(sum, load((y * self.width + x + i) * self.channels + c));
             }
+            s.store_part(&mut out[i * self.channels + c..][..lanes], sum);
         }
     }
 }

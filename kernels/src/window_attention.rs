@@ -23,14 +23,17 @@
 //! What the body changes, none of which can change a bit:
 //! 1. Keys (transposed) and values are packed into panels of 16 columns, so that the four products of a head are one
 //!    routine with tiles of 6 rows by 16 columns.
-//! 2. The offsets are spread out to one row per token once per call; all windows of the call use them.
-//! 3. Lanes beyond the last token hold -inf for the maximum and 0 for the sum.
+//! 2. A head's output joins the next head's part in a copy of the window.
+//! 3. Queries lie amid zeros, so that no tap of their convolution needs a test.
+//! 4. The offsets are spread out to one row per token once per call; all windows of the call use them.
+//! 5. Lanes beyond the last token hold -inf for the maximum and 0 for the sum.
 
 mod body;
 mod reference;
 #[cfg(test)]
 mod tests;
 
+use self::body::HALF;
 use crate::isa::Isa;
 use crate::panels::packed_len;
 use crate::simd::{Kernel, LANES, Simd, dispatch};
@@ -41,7 +44,7 @@ pub const SIDE: usize = 7;
 /// Side of the depthwise kernel on q.
 pub const QUERY_KERNEL: usize = 5;
 
-/// The sizes of an attention.
+/// The sizes of an attention, none of them 0.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shape {
     /// Extent of the plane, first axis first.
@@ -93,14 +96,15 @@ impl Shape {
     }
 
     /// Sizes of the parts of the scratch, in the order of [`Scratch`].
-    fn regions(&self) -> [usize; 9] {
+    fn regions(&self) -> [usize; 10] {
         let (tokens, padded) = (self.tokens(), self.tokens().next_multiple_of(LANES));
         let key_dim = self.key_dim.next_multiple_of(LANES);
         [
             self.heads * tokens * padded,
-            tokens * self.part(),
+            tokens * self.channels,
             tokens * (3 * self.key_dim).next_multiple_of(LANES),
-            2 * tokens * key_dim,
+            (self.window()[0] + 2 * HALF) * (self.window()[1] + 2 * HALF) * key_dim,
+            tokens * key_dim,
             packed_len(self.key_dim, tokens) + packed_len(tokens, self.key_dim),
             tokens * padded,
             tokens * key_dim,
@@ -179,17 +183,19 @@ pub fn window_attention(isa: Isa, args: &WindowAttention<'_>, window_row: usize,
 struct Scratch<'a> {
     /// `[heads, tokens, padded tokens]`: the offset of every pair of tokens.
     offsets: &'a mut [f32],
-    /// `[tokens, part]`: the head's input.
-    feature: &'a mut [f32],
+    /// `[tokens, channels]`: the window, to whose parts the heads' outputs are added.
+    window: &'a mut [f32],
     /// `[tokens, padded 3 * key_dim]`.
     qkv: &'a mut [f32],
-    /// Twice `[tokens, padded key_dim]`: q before and after its convolution.
+    /// `[height + 4, width + 4, padded key_dim]`: q amid zeros.
+    plane: &'a mut [f32],
+    /// `[tokens, padded key_dim]`: q after its convolution.
     query: &'a mut [f32],
     /// Packed keys, transposed: `key_dim` x tokens; then packed values: tokens x `key_dim`.
     packed: &'a mut [f32],
     /// `[tokens, padded tokens]`.
     scores: &'a mut [f32],
-    /// `[tokens, padded key_dim]`: the head's output, which the next head reads.
+    /// `[tokens, padded key_dim]`: the head's output.
     head: &'a mut [f32],
     /// `[tokens, heads * key_dim]`, rectified.
     heads: &'a mut [f32],
@@ -199,12 +205,12 @@ struct Scratch<'a> {
 
 impl<'a> Scratch<'a> {
     fn new(shape: &Shape, mut scratch: &'a mut [f32]) -> Self {
-        let [offsets, feature, qkv, query, packed, scores, head, heads, proj] = shape.regions().map(|len| {
+        let [offsets, window, qkv, plane, query, packed, scores, head, heads, proj] = shape.regions().map(|len| {
             let (part, rest) = std::mem::take(&mut scratch).split_at_mut(len);
             scratch = rest;
             part
         });
-        Self { offsets, feature, qkv, query, packed, scores, head, heads, proj }
+        Self { offsets, window, qkv, plane, query, packed, scores, head, heads, proj }
     }
 }
 
@@ -217,22 +223,6 @@ struct Run<'a> {
 }
 
 impl WindowAttention<'_> {
-    /// The token's position in the plane as (row within the call's rows, column), or `None` if it is padding.
-    #[inline(always)]
-    fn position(&self, rows: &Range<usize>, window: usize, token: usize) -> Option<[usize; 2]> {
-        let [_, width] = self.shape.window();
-        let at = [token / width, window * width + token % width];
-        (at[0] < rows.len() && at[1] < self.shape.extent[1]).then_some(at)
-    }
-
-    /// The offset between two tokens in head `head`.
-    #[inline(always)]
-    fn offset(&self, head: usize, t: usize, u: usize) -> f32 {
-        let (side, [_, width]) = (self.shape.side(), self.shape.window());
-        let (dx, dy) = ((t / width).abs_diff(u / width), (t % width).abs_diff(u % width));
-        self.offsets[head * side * side + dx * side + dy]
-    }
-
     /// The factor of the scores. Square root and division are correctly rounded everywhere.
     #[inline(always)]
     fn scale(&self) -> f32 {
@@ -258,10 +248,11 @@ impl Kernel for Run<'_> {
     fn run<S: Simd>(self, s: S) {
         let (args, rows) = (self.args, self.args.shape.rows(self.window_row));
         let mut scratch = Scratch::new(&args.shape, self.scratch);
-        args.spread_offsets(scratch.offsets);
+        args.prepare(&mut scratch);
         for window in 0..args.shape.extent[1].div_ceil(args.shape.window()[1]) {
+            args.load(&rows, window, scratch.window);
             for head in 0..args.shape.heads {
-                args.queries_keys_values(s, &rows, window, head, &mut scratch);
+                args.queries_keys_values(s, head, &mut scratch);
                 args.attend(s, head, &mut scratch);
             }
             args.project(s, &rows, window, &mut scratch, self.out);
@@ -269,7 +260,7 @@ impl Kernel for Run<'_> {
     }
 }
 
-/// The largest of 16 lanes by the tree of [`tree_sum`]; the earlier one where the comparison is false.
+/// The largest of 16 lanes by the tree of the sum; the earlier one where the comparison is false.
 #[inline(always)]
 fn tree_max(mut x: [f32; LANES]) -> f32 {
     for half in [8, 4, 2, 1] {

@@ -1,104 +1,104 @@
 //! The vector body: packed operands, tiles of rows by 16 columns.
 
-use super::{QUERY_KERNEL, Scratch, Shape, WindowAttention, tree_max};
-use crate::depthwise::{self, Depthwise};
+use super::{QUERY_KERNEL, SIDE, Scratch, Shape, WindowAttention, tree_max};
 use crate::math::exp_v;
 use crate::panels::packed_len;
-use crate::simd::{Kernel, LANES, Simd, relu, tree_sum};
+use crate::simd::{LANES, Simd, relu, tree_sum};
 use std::ops::Range;
 
 /// Rows of a tile: 12 accumulators of 8 lanes, the most that AVX2 holds beside weights and a broadcast.
 const TILE: usize = 6;
+/// Zeros before and after each axis of the queries.
+pub(super) const HALF: usize = QUERY_KERNEL / 2;
 
 impl WindowAttention<'_> {
-    /// One row of offsets per head and token, so that a row of scores needs no look-ups.
-    pub(super) fn spread_offsets(&self, out: &mut [f32]) {
-        let tokens = self.shape.tokens();
-        for (i, row) in out.chunks_exact_mut(tokens.next_multiple_of(LANES)).enumerate() {
-            for (u, out) in row.iter_mut().enumerate() {
-                *out = if u < tokens { self.offset(i / tokens, i % tokens, u) } else { 0.0 };
+    /// What all windows of a call share: the offsets, one row per head and token, and zeros around the queries.
+    pub(super) fn prepare(&self, scratch: &mut Scratch<'_>) {
+        let (side, [height, width]) = (self.shape.side(), self.shape.window());
+        let tokens = height * width;
+        let mut rows = scratch.offsets.chunks_exact_mut(tokens.next_multiple_of(LANES));
+        for table in self.offsets.chunks_exact(side * side) {
+            for (t, row) in (0..tokens).zip(&mut rows) {
+                for (ux, row) in row[..tokens].chunks_exact_mut(width).enumerate() {
+                    let table = &table[(t / width).abs_diff(ux) * side..][..side];
+                    for (uy, out) in row.iter_mut().enumerate() {
+                        *out = table[(t % width).abs_diff(uy)];
+                    }
+                }
+                row[tokens..].fill(0.0);
             }
+        }
+        scratch.plane.fill(0.0);
+    }
+
+    /// Copies a window, `[tokens, channels]`, with zeros for its padding.
+    pub(super) fn load(&self, rows: &Range<usize>, window: usize, out: &mut [f32]) {
+        let Shape { extent, channels, .. } = self.shape;
+        let width = self.shape.window()[1];
+        let inside = width.min(extent[1] - window * width) * channels;
+        for (dx, out) in out.chunks_exact_mut(width * channels).enumerate() {
+            if dx >= rows.len() {
+                out.fill(0.0);
+                continue;
+            }
+            let at = ((rows.start + dx) * extent[1] + window * width) * channels;
+            out[..inside].copy_from_slice(&self.input[at..at + inside]);
+            out[inside..].fill(0.0);
         }
     }
 
-    /// From the input and the previous head's output to convolved queries, packed keys and packed values.
+    /// From the head's part of the window to convolved queries, packed keys and packed values.
     #[inline(always)]
-    pub(super) fn queries_keys_values<S: Simd>(
-        &self,
-        s: S,
-        rows: &Range<usize>,
-        window: usize,
-        head: usize,
-        scratch: &mut Scratch<'_>,
-    ) {
-        let Shape { extent, channels, key_dim, .. } = self.shape;
-        let (part, tokens, [height, width]) = (self.shape.part(), self.shape.tokens(), self.shape.window());
+    pub(super) fn queries_keys_values<S: Simd>(&self, s: S, head: usize, scratch: &mut Scratch<'_>) {
+        let Shape { channels, key_dim, .. } = self.shape;
+        let (part, tokens, width) = (self.shape.part(), self.shape.tokens(), self.shape.window()[1]);
         let (pad, columns) = (key_dim.next_multiple_of(LANES), (3 * key_dim).next_multiple_of(LANES));
-        for (t, feature) in scratch.feature.chunks_exact_mut(part).enumerate() {
-            match self.position(rows, window, t) {
-                Some([row, column]) => {
-                    let at = ((rows.start + row) * extent[1] + column) * channels + head * part;
-                    feature.copy_from_slice(&self.input[at..at + part]);
-                }
-                None => feature.fill(0.0),
-            }
-            if head > 0 {
-                for (feature, previous) in feature.iter_mut().zip(&scratch.head[t * pad..]) {
-                    *feature += previous;
-                }
-            }
-        }
         let weights = packed_len(part, 3 * key_dim);
         let weights = &self.qkv[head * weights..(head + 1) * weights];
         let bias = &self.qkv_bias[head * columns..(head + 1) * columns];
-        product(s, scratch.feature, part, weights, Some(bias), scratch.qkv, columns);
+        let a = Rows { values: &scratch.window[head * part..], stride: channels };
+        product(s, a, weights, Some(bias), scratch.qkv, columns);
 
-        let (plane, convolved) = scratch.query.split_at_mut(tokens * pad);
         let (keys, values) = scratch.packed.split_at_mut(packed_len(key_dim, tokens));
         for (t, qkv) in scratch.qkv.chunks_exact(columns).enumerate() {
-            plane[t * pad..t * pad + key_dim].copy_from_slice(&qkv[..key_dim]);
-            plane[t * pad + key_dim..(t + 1) * pad].fill(0.0);
+            let at = (t / width + HALF) * (width + 2 * HALF) + t % width + HALF;
+            copy(&qkv[..key_dim], &mut scratch.plane[at * pad..]);
             let panel = &mut keys[t / LANES * key_dim * LANES..][..key_dim * LANES];
             for (lanes, k) in panel.chunks_exact_mut(LANES).zip(&qkv[key_dim..2 * key_dim]) {
                 lanes[t % LANES] = *k;
             }
             for (panel, v) in qkv[2 * key_dim..3 * key_dim].chunks(LANES).enumerate() {
-                let lanes = &mut values[(panel * tokens + t) * LANES..][..LANES];
-                lanes[..v.len()].copy_from_slice(v);
-                lanes[v.len()..].fill(0.0);
+                copy(v, &mut values[(panel * tokens + t) * LANES..][..LANES]);
             }
         }
         let taps = QUERY_KERNEL * QUERY_KERNEL * pad;
-        let convolution = Depthwise {
-            input: plane,
-            height,
-            width,
-            channels: pad,
-            kernel: QUERY_KERNEL,
-            weights: &self.query[head * taps..(head + 1) * taps],
-            bias: &self.query_bias[head * pad..(head + 1) * pad],
-            residual: false,
-        };
-        depthwise::Run { args: &convolution, rows: 0..height, out: convolved }.run(s);
+        let taps = &self.query[head * taps..(head + 1) * taps];
+        convolve(s, self.shape.window(), scratch.plane, taps, &self.query_bias[head * pad..][..pad], scratch.query);
     }
 
-    /// Scores, softmax and the weighted sum of the values.
+    /// Scores, softmax and the weighted sum of the values, which also joins the next head's part of the window.
     #[inline(always)]
     pub(super) fn attend<S: Simd>(&self, s: S, head: usize, scratch: &mut Scratch<'_>) {
-        let (key_dim, tokens) = (self.shape.key_dim, self.shape.tokens());
+        let Shape { channels, heads, key_dim, .. } = self.shape;
+        let tokens = self.shape.tokens();
         let (pad, padded) = (key_dim.next_multiple_of(LANES), tokens.next_multiple_of(LANES));
         let (keys, values) = scratch.packed.split_at(packed_len(key_dim, tokens));
-        product(s, &scratch.query[tokens * pad..], pad, keys, None, scratch.scores, padded);
+        product(s, Rows { values: scratch.query, stride: pad }, keys, None, scratch.scores, padded);
         let offsets = &scratch.offsets[head * tokens * padded..(head + 1) * tokens * padded];
         for (scores, offsets) in scratch.scores.chunks_exact_mut(padded).zip(offsets.chunks_exact(padded)) {
             softmax(s, scores, offsets, tokens, self.scale());
         }
-        product(s, scratch.scores, padded, values, None, scratch.head, pad);
-        let depth = self.shape.heads * key_dim;
-        for (t, all) in scratch.heads.chunks_exact_mut(depth).enumerate() {
-            let out = &scratch.head[t * pad..t * pad + key_dim];
-            for (all, x) in all[head * key_dim..(head + 1) * key_dim].iter_mut().zip(out) {
+        product(s, Rows { values: scratch.scores, stride: padded }, values, None, scratch.head, pad);
+        for (t, out) in scratch.head.chunks_exact(pad).enumerate() {
+            let all = &mut scratch.heads[(t * heads + head) * key_dim..][..key_dim];
+            for (all, x) in all.iter_mut().zip(out) {
                 *all = relu(*x);
+            }
+            if head + 1 < heads {
+                let next = &mut scratch.window[t * channels + (head + 1) * key_dim..][..key_dim];
+                for (next, x) in next.iter_mut().zip(out) {
+                    *next += x;
+                }
             }
         }
     }
@@ -114,10 +114,14 @@ impl WindowAttention<'_> {
         out: &mut [f32],
     ) {
         let Shape { extent, channels, heads, key_dim, .. } = self.shape;
-        let columns = channels.next_multiple_of(LANES);
-        product(s, scratch.heads, heads * key_dim, self.proj, Some(self.proj_bias), scratch.proj, columns);
+        let (columns, width) = (channels.next_multiple_of(LANES), self.shape.window()[1]);
+        let a = Rows { values: scratch.heads, stride: heads * key_dim };
+        product(s, a, self.proj, Some(self.proj_bias), scratch.proj, columns);
         for (t, y) in scratch.proj.chunks_exact(columns).enumerate() {
-            let Some([row, column]) = self.position(rows, window, t) else { continue };
+            let (row, column) = (t / width, window * width + t % width);
+            if row >= rows.len() || column >= extent[1] {
+                continue;
+            }
             let x = &self.input[((rows.start + row) * extent[1] + column) * channels..][..channels];
             let out = &mut out[(row * extent[1] + column) * channels..][..channels];
             for ((out, x), y) in out.chunks_mut(LANES).zip(x.chunks(LANES)).zip(y.chunks_exact(LANES)) {
@@ -127,68 +131,130 @@ impl WindowAttention<'_> {
     }
 }
 
+/// Copies all of `from` to the start of `to`. A loop, as it is a handful of numbers.
+#[inline(always)]
+fn copy(from: &[f32], to: &mut [f32]) {
+    for (from, to) in from.iter().zip(to) {
+        *to = *from;
+    }
+}
+
+/// The depthwise convolution of `plane`, a window of queries with [`HALF`] zeros on all sides, into `out`.
+#[inline(always)]
+fn convolve<S: Simd>(s: S, [height, width]: [usize; 2], plane: &[f32], taps: &[f32], bias: &[f32], out: &mut [f32]) {
+    let pad = bias.len();
+    for c in (0..pad).step_by(LANES) {
+        for x in 0..height {
+            let mut y = 0;
+            while y < width {
+                let plane = &plane[(x * (width + 2 * HALF) + y) * pad + c..];
+                let out = &mut out[(x * width + y) * pad + c..];
+                let stride = [(width + 2 * HALF) * pad, pad];
+                if y + SIDE <= width {
+                    convolve_tile::<S, SIDE>(s, plane, stride, &taps[c..], &bias[c..], out);
+                    y += SIDE;
+                } else {
+                    convolve_tile::<S, 1>(s, plane, stride, &taps[c..], &bias[c..], out);
+                    y += 1;
+                }
+            }
+        }
+    }
+}
+
+/// `N` neighbouring outputs of [`convolve`], 16 channels of each. The slices start at the first one's first tap.
+#[inline(always)]
+fn convolve_tile<S: Simd, const N: usize>(
+    s: S,
+    plane: &[f32],
+    [row, column]: [usize; 2],
+    taps: &[f32],
+    bias: &[f32],
+    out: &mut [f32],
+) {
+    let mut sums = [s.load(lanes(bias)); N];
+    for ky in 0..QUERY_KERNEL {
+        for kx in 0..QUERY_KERNEL {
+            let w = s.load(lanes(&taps[(ky * QUERY_KERNEL + kx) * column..]));
+            let plane = &plane[ky * row + kx * column..];
+            for (i, sum) in sums.iter_mut().enumerate() {
+                *sum = s.mul_add(s.load(lanes(&plane[i * column..])), w, *sum);
+            }
+        }
+    }
+    for (i, sum) in sums.into_iter().enumerate() {
+        s.store(lanes_mut(&mut out[i * column..]), sum);
+    }
+}
+
+/// The first 16 numbers of a slice that has them.
+#[inline(always)]
+fn lanes(x: &[f32]) -> &[f32; LANES] {
+    x.first_chunk().expect("rows are padded to whole vectors")
+}
+
+/// As [`lanes`].
+#[inline(always)]
+fn lanes_mut(x: &mut [f32]) -> &mut [f32; LANES] {
+    x.first_chunk_mut().expect("rows are padded to whole vectors")
+}
+
 /// `scores`, the dot products of a token with the keys, become probabilities. Lanes from `tokens` on become 0.
 #[inline(always)]
 fn softmax<S: Simd>(s: S, scores: &mut [f32], offsets: &[f32], tokens: usize, scale: f32) {
-    for (score, offset) in scores.chunks_exact_mut(LANES).zip(offsets.chunks_exact(LANES)) {
-        let y = s.mul_add(s.load_part(score), s.splat(scale), s.load_part(offset));
-        s.store_part(score, y);
+    let (offsets, _) = offsets.as_chunks();
+    for (score, offset) in scores.as_chunks_mut().0.iter_mut().zip(offsets) {
+        let y = s.mul_add(s.load(score), s.splat(scale), s.load(offset));
+        s.store(score, y);
     }
     scores[tokens..].fill(f32::NEG_INFINITY);
     let mut max = s.splat(f32::NEG_INFINITY);
-    for score in scores.chunks_exact(LANES) {
-        max = s.max(s.load_part(score), max);
+    for score in scores.as_chunks().0 {
+        max = s.max(s.load(score), max);
     }
     let max = s.splat(tree_max(s.lanes(max)));
-    for score in scores.chunks_exact_mut(LANES) {
-        let y = exp_v(s, s.sub(s.load_part(score), max));
-        s.store_part(score, y);
+    for score in scores.as_chunks_mut().0 {
+        let y = exp_v(s, s.sub(s.load(score), max));
+        s.store(score, y);
     }
     scores[tokens..].fill(0.0);
     let mut sum = s.splat(0.0);
-    for score in scores.chunks_exact(LANES) {
-        sum = s.add(sum, s.load_part(score));
+    for score in scores.as_chunks().0 {
+        sum = s.add(sum, s.load(score));
     }
     let sum = s.splat(tree_sum(s.lanes(sum)));
-    for score in scores.chunks_exact_mut(LANES) {
-        let y = s.div(s.load_part(score), sum);
-        s.store_part(score, y);
+    for score in scores.as_chunks_mut().0 {
+        let y = s.div(s.load(score), sum);
+        s.store(score, y);
     }
+}
+
+/// The left matrix of a [`product`]: rows `stride` apart, the first one at the start of `values`.
+#[derive(Clone, Copy)]
+struct Rows<'a> {
+    values: &'a [f32],
+    stride: usize,
 }
 
 /// `out[r][n] = bias[n] + a[r][0] * w[0][n] + a[r][1] * w[1][n] + ...`, one chain, for all columns of the packed panels.
 ///
-/// The rows of `a` are `stride` apart and may be longer than the depth. A row of `out` has `columns` numbers, a multiple
-/// of 16; `weights` are `columns / 16` panels, which gives the depth. Without a bias the chain starts at 0.
+/// A row of `out` has `columns` numbers, a multiple of 16; `weights` are `columns / 16` panels, which gives the depth, and
+/// rows of `a` may go on beyond it. Without a bias the chain starts at 0.
 #[inline(always)]
-fn product<S: Simd>(
-    s: S,
-    a: &[f32],
-    stride: usize,
-    weights: &[f32],
-    bias: Option<&[f32]>,
-    out: &mut [f32],
-    columns: usize,
-) {
+fn product<S: Simd>(s: S, a: Rows<'_>, weights: &[f32], bias: Option<&[f32]>, out: &mut [f32], columns: usize) {
     let (panel_len, rows) = (weights.len() / columns * LANES, out.len() / columns);
     for (i, panel) in weights.chunks_exact(panel_len).enumerate() {
-        let (panel, _) = panel.as_chunks::<LANES>();
-        let start = bias.map_or(s.splat(0.0), |bias| s.load_part(&bias[i * LANES..]));
+        let (panel, _) = panel.as_chunks();
+        let start = s.load(bias.map_or(&[0.0; LANES], |bias| lanes(&bias[i * LANES..])));
         let mut r = 0;
         while r < rows {
+            let a = Rows { values: &a.values[r * a.stride..], ..a };
+            let out = &mut out[r * columns + i * LANES..];
             if r + TILE <= rows {
-                tile::<S, TILE>(
-                    s,
-                    &a[r * stride..],
-                    stride,
-                    panel,
-                    start,
-                    &mut out[r * columns + i * LANES..],
-                    columns,
-                );
+                tile::<S, TILE>(s, a, panel, start, out, columns);
                 r += TILE;
             } else {
-                tile::<S, 1>(s, &a[r * stride..], stride, panel, start, &mut out[r * columns + i * LANES..], columns);
+                tile::<S, 1>(s, a, panel, start, out, columns);
                 r += 1;
             }
         }
@@ -199,14 +265,13 @@ fn product<S: Simd>(
 #[inline(always)]
 fn tile<S: Simd, const R: usize>(
     s: S,
-    a: &[f32],
-    stride: usize,
+    a: Rows<'_>,
     panel: &[[f32; LANES]],
     start: S::V,
     out: &mut [f32],
     columns: usize,
 ) {
-    let rows: [&[f32]; R] = std::array::from_fn(|r| &a[r * stride..][..panel.len()]);
+    let rows: [&[f32]; R] = std::array::from_fn(|r| &a.values[r * a.stride..][..panel.len()]);
     let mut sums = [start; R];
     for (k, w) in panel.iter().enumerate() {
         let w = s.load(w);
@@ -215,6 +280,6 @@ fn tile<S: Simd, const R: usize>(
         }
     }
     for (r, sum) in sums.into_iter().enumerate() {
-        s.store_part(&mut out[r * columns..], sum);
+        s.store(lanes_mut(&mut out[r * columns..]), sum);
     }
 }

@@ -7,6 +7,20 @@ use crate::simd::{LANES, relu, tree_sum};
 use std::ops::Range;
 
 impl WindowAttention<'_> {
+    /// The token's position in the plane as (row within the call's rows, column), or `None` if it is padding.
+    fn position(&self, rows: &Range<usize>, window: usize, token: usize) -> Option<[usize; 2]> {
+        let [_, width] = self.shape.window();
+        let at = [token / width, window * width + token % width];
+        (at[0] < rows.len() && at[1] < self.shape.extent[1]).then_some(at)
+    }
+
+    /// The offset between two tokens in head `head`.
+    fn offset(&self, head: usize, t: usize, u: usize) -> f32 {
+        let (side, [_, width]) = (self.shape.side(), self.shape.window());
+        let (dx, dy) = ((t / width).abs_diff(u / width), (t % width).abs_diff(u % width));
+        self.offsets[head * side * side + dx * side + dy]
+    }
+
     /// One head of one window.
     pub(super) fn reference_head(&self, rows: &Range<usize>, window: usize, head: usize, scratch: &mut Scratch<'_>) {
         let Shape { extent, channels, heads, key_dim, .. } = self.shape;
@@ -17,7 +31,7 @@ impl WindowAttention<'_> {
                 let x = self.position(rows, window, t).map_or(0.0, |[row, column]| {
                     self.input[((rows.start + row) * extent[1] + column) * channels + head * part + i]
                 });
-                scratch.feature[t * part + i] = if head == 0 { x } else { x + scratch.head[t * key_dim + i] };
+                scratch.window[t * part + i] = if head == 0 { x } else { x + scratch.head[t * key_dim + i] };
             }
         }
         let weights = &self.qkv[head * packed_len(part, 3 * key_dim)..];
@@ -25,7 +39,7 @@ impl WindowAttention<'_> {
             for n in 0..3 * key_dim {
                 let mut sum = self.qkv_bias[head * (3 * key_dim).next_multiple_of(LANES) + n];
                 for i in 0..part {
-                    sum = scratch.feature[t * part + i].mul_add(weights[packed_index(part, i, n)], sum);
+                    sum = scratch.window[t * part + i].mul_add(weights[packed_index(part, i, n)], sum);
                 }
                 scratch.qkv[t * 3 * key_dim + n] = sum;
             }
