@@ -1,5 +1,7 @@
 //! voxcast turns a ring of camera images into a semantic voxel grid on a plain CPU.
 
+#[cfg(feature = "import")]
+pub mod checkpoint;
 pub mod error;
 pub mod network;
 pub mod rig;
