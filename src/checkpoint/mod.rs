@@ -50,6 +50,18 @@ struct Contents {
     names: BTreeMap<String, usize>,
 }
 
+/// What `DataParallel` puts in front of every name.
+const PREFIX: &str = "module.";
+
+impl Contents {
+    fn without_prefix(mut self) -> Self {
+        if self.names.keys().all(|name| name.len() > PREFIX.len() && name.starts_with(PREFIX)) {
+            self.names = self.names.into_iter().map(|(name, i)| (name[PREFIX.len()..].to_owned(), i)).collect();
+        }
+        self
+    }
+}
+
 enum Bytes {
     Mapped(memmap2::Mmap),
     Owned(Vec<u8>),
@@ -118,7 +130,7 @@ impl Checkpoint {
                 "begins with bytes {head:02x?}, expected a zip as torch.save writes it (PK\\x03\\x04) or a safetensors header"
             )));
         };
-        Ok(Self { bytes, contents })
+        Ok(Self { bytes, contents: contents.without_prefix() })
     }
 
     /// Names of the tensors in ascending order of their bytes.

@@ -75,6 +75,9 @@ pub(super) struct TensorRef {
     pub(super) stride: Id,
 }
 
+// Together with its place on the stack this is what one byte of input can cost, up to `MAX_VALUES` times.
+const _: () = assert!(size_of::<Value>() <= 32);
+
 impl Value {
     /// The word for it in messages.
     pub(super) fn kind(&self) -> &'static str {

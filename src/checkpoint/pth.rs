@@ -10,9 +10,6 @@ use std::collections::{BTreeMap, HashMap};
 /// Newest archive version; `torch.save` writes 3, and nothing yet more than this.
 const MAX_VERSION: u32 = 10;
 
-/// What `DataParallel` puts in front of every name.
-const PREFIX: &str = "module.";
-
 /// Lists the tensors of the archive that fills `file`.
 pub(super) fn read(file: &[u8]) -> Result<Contents> {
     let mut archive = Archive::open(file)?;
@@ -38,12 +35,9 @@ pub(super) fn read(file: &[u8]) -> Result<Contents> {
             reader.add(name, value, tensor)?;
         }
     }
-    let mut contents = reader.contents;
+    let contents = reader.contents;
     if contents.names.is_empty() {
         return Err(Error::format(format!("the state dict holds no tensors; {}", keys(&pickle, dict))));
-    }
-    if contents.names.keys().all(|name| name.len() > PREFIX.len() && name.starts_with(PREFIX)) {
-        contents.names = contents.names.into_iter().map(|(name, i)| (name[PREFIX.len()..].to_owned(), i)).collect();
     }
     Ok(contents)
 }

@@ -103,27 +103,25 @@ impl Tensor {
         if self.shape.contains(&0) { 0 } else { self.shape.iter().product() }
     }
 
-    /// Calls `each` with the `N` bytes of every element of `bytes`, the last dimension fastest.
+    /// `value` of the `N` bytes of every element, the last dimension fastest.
     ///
-    /// `check` has proved that the elements lie in the storage.
-    fn for_each<const N: usize>(&self, bytes: &[u8], mut each: impl FnMut([u8; N])) {
+    /// `check` has proved that the elements lie in the storage, whose `bytes` these are.
+    fn decode<const N: usize, T>(&self, bytes: &[u8], value: impl Fn([u8; N]) -> T) -> Vec<T> {
         let (stored, _) = bytes.as_chunks::<N>();
         let len = self.len();
         if len == 0 {
-            return;
+            return Vec::new();
         }
         if *self.stride == *Self::contiguous(&self.shape) {
-            stored[self.offset..self.offset + len].iter().for_each(|&e| each(e));
-            return;
+            return stored[self.offset..self.offset + len].iter().map(|&e| value(e)).collect();
         }
+        let mut out = Vec::with_capacity(len);
         // A scalar has no strides and is contiguous, so there is a last dimension here.
         let inner = self.shape.len() - 1;
         let mut index = vec![0usize; inner];
         for _ in 0..len / self.shape[inner] {
             let start: usize = self.offset + index.iter().zip(&self.stride).map(|(i, s)| i * s).sum::<usize>();
-            for i in 0..self.shape[inner] {
-                each(stored[start + i * self.stride[inner]]);
-            }
+            out.extend((0..self.shape[inner]).map(|i| value(stored[start + i * self.stride[inner]])));
             for d in (0..inner).rev() {
                 index[d] += 1;
                 if index[d] < self.shape[d] {
@@ -132,6 +130,7 @@ impl Tensor {
                 index[d] = 0;
             }
         }
+        out
     }
 
     /// Index of the element that is `at`-th in row-major order.
@@ -158,23 +157,22 @@ pub struct TensorView<'a> {
 macro_rules! convert {
     ($view:expr, $bytes:expr, $t:ty) => {{
         let (tensor, bytes) = ($view.tensor, $bytes);
-        let mut out: Vec<$t> = Vec::with_capacity(tensor.len());
-        match tensor.element.dtype {
-            Dtype::F64 => tensor.for_each(bytes, |b| out.push(f64::from_le_bytes(b) as $t)),
-            Dtype::F32 => tensor.for_each(bytes, |b| out.push(f32::from_le_bytes(b) as $t)),
-            Dtype::F16 => tensor.for_each(bytes, |b| out.push(f16::from_le_bytes(b).to_f32() as $t)),
-            Dtype::Bf16 => tensor.for_each(bytes, |b| out.push(bf16::from_le_bytes(b).to_f32() as $t)),
-            Dtype::I64 => tensor.for_each(bytes, |b| out.push(i64::from_le_bytes(b) as $t)),
-            Dtype::I32 => tensor.for_each(bytes, |b| out.push(i32::from_le_bytes(b) as $t)),
-            Dtype::I16 => tensor.for_each(bytes, |b| out.push(i16::from_le_bytes(b) as $t)),
-            Dtype::I8 => tensor.for_each(bytes, |b| out.push(i8::from_le_bytes(b) as $t)),
-            Dtype::U64 => tensor.for_each(bytes, |b| out.push(u64::from_le_bytes(b) as $t)),
-            Dtype::U32 => tensor.for_each(bytes, |b| out.push(u32::from_le_bytes(b) as $t)),
-            Dtype::U16 => tensor.for_each(bytes, |b| out.push(u16::from_le_bytes(b) as $t)),
-            Dtype::U8 => tensor.for_each(bytes, |b| out.push(u8::from_le_bytes(b) as $t)),
-            Dtype::Bool => tensor.for_each(bytes, |b| out.push((u8::from_le_bytes(b) != 0) as u8 as $t)),
+        let out: Vec<$t> = match tensor.element.dtype {
+            Dtype::F64 => tensor.decode(bytes, |b| f64::from_le_bytes(b) as $t),
+            Dtype::F32 => tensor.decode(bytes, |b| f32::from_le_bytes(b) as $t),
+            Dtype::F16 => tensor.decode(bytes, |b| f16::from_le_bytes(b).to_f32() as $t),
+            Dtype::Bf16 => tensor.decode(bytes, |b| bf16::from_le_bytes(b).to_f32() as $t),
+            Dtype::I64 => tensor.decode(bytes, |b| i64::from_le_bytes(b) as $t),
+            Dtype::I32 => tensor.decode(bytes, |b| i32::from_le_bytes(b) as $t),
+            Dtype::I16 => tensor.decode(bytes, |b| i16::from_le_bytes(b) as $t),
+            Dtype::I8 => tensor.decode(bytes, |b| i8::from_le_bytes(b) as $t),
+            Dtype::U64 => tensor.decode(bytes, |b| u64::from_le_bytes(b) as $t),
+            Dtype::U32 => tensor.decode(bytes, |b| u32::from_le_bytes(b) as $t),
+            Dtype::U16 => tensor.decode(bytes, |b| u16::from_le_bytes(b) as $t),
+            Dtype::U8 => tensor.decode(bytes, |b| u8::from_le_bytes(b) as $t),
+            Dtype::Bool => tensor.decode(bytes, |b| (u8::from_le_bytes(b) != 0) as u8 as $t),
             Dtype::Other => return Err($view.not_numbers()),
-        }
+        };
         match out.iter().position(|v| !v.is_finite()) {
             Some(at) => Err($view.not_finite(bytes, at, out[at] as f64)),
             None => Ok(out),
@@ -239,16 +237,10 @@ impl<'a> TensorView<'a> {
 
     /// `found` is what became of the element; a stored f64 may itself be finite.
     fn not_finite(&self, bytes: &[u8], at: usize, found: f64) -> Error {
-        let mut seen = 0;
-        let mut stored = found;
-        if self.dtype() == Dtype::F64 {
-            self.tensor.for_each(bytes, |b| {
-                if seen == at {
-                    stored = f64::from_le_bytes(b);
-                }
-                seen += 1;
-            });
-        }
+        let stored = match self.dtype() {
+            Dtype::F64 => self.tensor.decode(bytes, f64::from_le_bytes)[at],
+            _ => found,
+        };
         let beyond = if stored.is_finite() { ", beyond the range of f32" } else { "" };
         let index = self.tensor.unravel(at);
         Error::format(format!("tensor {:?}: element {index:?} is {stored:?}{beyond}", self.name))

@@ -241,7 +241,7 @@ fn deflated_archives_are_read() {
 #[test]
 fn safetensors_hold_the_same() {
     let bytes = le![1.0f32, -2.0f32, 0.5f32, 4.0f32];
-    let header = br#"{"w":{"dtype":"F32","shape":[2,2],"data_offsets":[0,16]},"n":{"dtype":"I64","shape":[],"data_offsets":[16,24]}}"#;
+    let header = br#"{"module.w":{"dtype":"F32","shape":[2,2],"data_offsets":[0,16]},"module.n":{"dtype":"I64","shape":[],"data_offsets":[16,24]}}"#;
     let file = [&(header.len() as u64).to_le_bytes()[..], header, &bytes, &3i64.to_le_bytes()].concat();
     let checkpoint = read(file);
     assert_eq!(checkpoint.names().collect::<Vec<_>>(), ["n", "w"]);
