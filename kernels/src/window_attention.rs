@@ -174,7 +174,7 @@ impl WindowAttention<'_> {
 /// # Determinism
 /// The same bits on every instruction set. Windows do not depend on each other, so rows of windows may be computed in
 /// any order and on any thread.
-pub fn window_attention(isa: Isa, args: &WindowAttention<'_>, window_row: usize, scratch: &mut [f32], out: &mut [f32]) {
+pub fn window_attention(isa: Isa, args: &WindowAttention<'_>, window_row: usize, out: &mut [f32], scratch: &mut [f32]) {
     args.check(window_row, scratch, out);
     dispatch(isa, Run { args, window_row, scratch, out });
 }

@@ -62,7 +62,7 @@ impl Case {
         let mut junk = || [f32::NAN, 1e20, -1e20, 7.0][rng.bits() as usize % 4];
         let mut scratch: Vec<f32> = (0..self.shape.scratch_len()).map(|_| junk()).collect();
         let mut out = vec![f32::NAN; self.shape.rows(row).len() * self.shape.extent[1] * self.shape.channels];
-        window_attention(isa, &self.args(), row, &mut scratch, &mut out);
+        window_attention(isa, &self.args(), row, &mut out, &mut scratch);
         out
     }
 
@@ -366,7 +366,7 @@ fn slices_of_another_size_panic() {
 #[should_panic(expected = "window row 2 of 2")]
 fn no_such_window_row() {
     let case = case();
-    window_attention(Isa::Scalar, &case.args(), 2, &mut vec![0.0; case.shape.scratch_len()], &mut []);
+    window_attention(Isa::Scalar, &case.args(), 2, &mut [], &mut vec![0.0; case.shape.scratch_len()]);
 }
 
 #[test]
@@ -374,7 +374,7 @@ fn no_such_window_row() {
 fn short_scratch() {
     let case = case();
     let mut scratch = vec![0.0; case.shape.scratch_len() - 1];
-    window_attention(Isa::Scalar, &case.args(), 0, &mut scratch, &mut [0.0; 7 * 9 * 6]);
+    window_attention(Isa::Scalar, &case.args(), 0, &mut [0.0; 7 * 9 * 6], &mut scratch);
 }
 
 #[test]
@@ -382,5 +382,5 @@ fn short_scratch() {
 fn output_of_another_row() {
     let case = case();
     let mut scratch = vec![0.0; case.shape.scratch_len()];
-    window_attention(Isa::Scalar, &case.args(), 1, &mut scratch, &mut [0.0; 7 * 9 * 6]);
+    window_attention(Isa::Scalar, &case.args(), 1, &mut [0.0; 7 * 9 * 6], &mut scratch);
 }
