@@ -15,6 +15,8 @@ pub mod panels;
 pub mod peak;
 pub mod product;
 mod simd;
+#[cfg(test)]
+mod testing;
 
 pub use isa::{Isa, IsaError};
 pub use panels::Panels;
