@@ -414,7 +414,7 @@ mod tests {
     #[test]
     #[should_panic(expected = "the input has another shape")]
     fn short_input() {
-        broken(|case| drop(case.input.pop()));
+        broken(|case| case.input.truncate(23));
     }
 
     #[test]
@@ -438,7 +438,7 @@ mod tests {
     #[test]
     #[should_panic(expected = "the added tensor has another shape")]
     fn short_added_tensor() {
-        broken(|case| drop(case.add.as_mut().unwrap().pop()));
+        broken(|case| case.add.as_mut().unwrap().truncate(479));
     }
 
     #[test]

@@ -314,7 +314,7 @@ fn broken(damage: impl FnOnce(&mut Case)) {
 #[test]
 #[should_panic(expected = "the input has another shape")]
 fn short_input() {
-    broken(|case| drop(case.input.pop()));
+    broken(|case| case.input.truncate(39));
 }
 
 #[test]
