@@ -53,10 +53,30 @@ impl Geometry {
     }
 
     /// # Panics
-    /// If an extent is zero or `input` has another size.
+    /// If an extent is zero, a position cannot be counted, or `input` has another size.
     pub(crate) fn check(&self, input: &[f32]) {
-        assert_eq!(input.len(), self.input.iter().product::<usize>() * self.channels, "the input has another shape");
-        assert!(self.kernel.iter().chain(&self.stride).chain(&self.dilation).all(|&v| v > 0), "an extent is zero");
+        let extents = [self.input, self.kernel, self.stride, self.dilation];
+        assert!(extents.as_flattened().iter().all(|&v| v > 0), "an extent is zero");
+        let product = |of: [usize; 3], by: usize| of.iter().try_fold(by, |a, &b| a.checked_mul(b));
+        let reach = |axis: usize| {
+            let last = self.output[axis].saturating_sub(1).checked_mul(self.stride[axis])?;
+            let tap = (self.kernel[axis] - 1).checked_mul(self.dilation[axis])?;
+            let reach = last.checked_add(tap)?.checked_add(self.padding[axis])?.checked_add(self.input[axis])?;
+            isize::try_from(reach.checked_mul(self.channels.max(1))?).ok()
+        };
+        assert!(
+            (0..3).all(|axis| reach(axis).is_some())
+                && product(self.output, 1).is_some()
+                && product(self.kernel, self.channels).is_some(),
+            "the geometry overflows"
+        );
+        assert_eq!(Some(input.len()), product(self.input, self.channels), "the input has another shape");
+    }
+
+    /// Whether no window starts behind the input, where there is no padding before it either.
+    #[inline(always)]
+    fn starts_inside(&self) -> bool {
+        (0..3).all(|axis| self.padding[axis] == 0 && (self.output[axis] - 1) * self.stride[axis] < self.input[axis])
     }
 }
 
@@ -81,10 +101,8 @@ pub struct Conv<'a> {
 /// The same bits on every instruction set and for every division into rows.
 pub fn conv(isa: Isa, args: &Conv<'_>, rows: Range<usize>, stride: usize, out: &mut [f32], scratch: &mut [f32]) {
     args.geometry.check(args.input);
-    args.product.check();
     assert_eq!(args.product.depth, args.geometry.depth(), "the weights belong to another kernel");
-    assert!(rows.end <= args.geometry.rows() && stride >= args.product.columns, "rows out of range");
-    assert!(out.len() + stride >= rows.len() * stride + args.product.columns, "the output is shorter than its rows");
+    args.product.check_rows(&rows, args.geometry.rows(), stride, out, scratch);
     dispatch(isa, Run { args, rows, stride, out, scratch });
 }
 
@@ -177,10 +195,10 @@ impl Source for Conv<'_> {
     #[inline(always)]
     fn stored(&self, row: usize, k: usize, len: usize) -> Option<&[f32]> {
         let g = &self.geometry;
-        if g.kernel != [1; 3] || g.padding != [0; 3] {
+        if g.kernel != [1; 3] || !g.starts_inside() {
             return None;
         }
-        let row = if g.stride == [1; 3] {
+        let row = if g.output == g.input && g.stride == [1; 3] {
             row
         } else {
             let [d, h, w] = g.position(row);
@@ -202,3 +220,6 @@ fn copy<S: Simd>(s: S, from: &[f32], to: &mut [f32]) {
         *to = *from;
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -53,12 +53,10 @@ pub fn deform_conv2d(
 ) {
     let g = &args.geometry;
     g.check(args.input);
-    args.product.check();
     assert!([g.input[0], g.output[0], g.kernel[0]] == [1; 3], "a deformable convolution is two-dimensional");
     assert_eq!(args.product.depth, g.depth(), "the weights belong to another kernel");
     assert_eq!(args.offsets.len(), g.rows() * 3 * args.taps(), "the offsets belong to another kernel");
-    assert!(rows.end <= g.rows() && stride >= args.product.columns, "rows out of range");
-    assert!(out.len() + stride >= rows.len() * stride + args.product.columns, "the output is shorter than its rows");
+    args.product.check_rows(&rows, g.rows(), stride, out, scratch);
     dispatch(isa, Run { args, rows, stride, out, scratch });
 }
 
@@ -180,3 +178,6 @@ impl Kernel for Run<'_> {
         product(s, &self.args.product, self.args, &target, self.rows, self.out, self.scratch);
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -6,7 +6,7 @@
 //! ```
 //!
 //! Channels are the vector axis: a feature pixel is one contiguous piece of memory, and a row's sum stays in registers
-//! while its pixels stream by. The next row's first pixels are named to the cache while the current row is summed.
+//! while its pixels stream by.
 
 use crate::isa::Isa;
 use crate::simd::{Kernel, LANES, Simd, dispatch, relu};
@@ -44,8 +44,10 @@ pub struct Gather<'a> {
 /// # Determinism
 /// The same bits on every instruction set and for every division into rows.
 pub fn gather(isa: Isa, args: &Gather<'_>, rows: Range<usize>, out: &mut [f32]) {
-    assert!(args.first_channel + args.channels <= args.stride, "channels out of range");
-    assert!(rows.end < args.ptr.len(), "rows out of range");
+    let behind = args.stride.checked_sub(args.first_channel);
+    assert!(behind.is_some_and(|c| c >= args.channels), "channels out of range");
+    let total = args.ptr.len().saturating_sub(1);
+    assert!(rows.start <= rows.end && rows.end <= total, "rows {rows:?} of {total}");
     assert_eq!(out.len(), rows.len() * args.channels, "the output does not hold the rows");
     assert!(args.bias.is_none_or(|b| b.len() >= args.channels), "the bias is shorter than the channels");
     dispatch(isa, Run { args, rows, out });
@@ -73,7 +75,7 @@ impl Kernel for Run<'_> {
 
     fn reference(self) {
         let a = self.args;
-        for (row, out) in self.rows.zip(self.out.chunks_exact_mut(a.channels)) {
+        for (row, out) in self.rows.zip(self.out.chunks_exact_mut(a.channels.max(1))) {
             for (c, out) in out.iter_mut().enumerate() {
                 let cols = a.row(row);
                 let mut sum = 0.0;
@@ -94,7 +96,7 @@ impl Kernel for Run<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
         let a = self.args;
-        for (row, out) in self.rows.zip(self.out.chunks_exact_mut(a.channels)) {
+        for (row, out) in self.rows.zip(self.out.chunks_exact_mut(a.channels.max(1))) {
             let cols = a.row(row);
             let count = s.splat(cols.len().max(1) as f32);
             let mut channel = 0;
@@ -139,4 +141,269 @@ fn finish<S: Simd>(s: S, a: &Gather<'_>, channel: usize, count: S::V, sum: S::V,
         value = s.relu(value);
     }
     s.store_part(out, value);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{Fill, Rng, Tally, assert_close, assert_lively, assert_same_bits};
+    use proptest::prelude::*;
+    use proptest::test_runner::{Config, TestRunner};
+
+    struct Case {
+        ptr: Vec<u32>,
+        col: Vec<u32>,
+        features: Vec<f32>,
+        stride: usize,
+        first_channel: usize,
+        channels: usize,
+        bias: Option<Vec<f32>>,
+        relu: bool,
+    }
+
+    impl Case {
+        /// Rows of these lengths over `pixels` pixels, of whose `stride` channels `channels` are gathered; the others are
+        /// NaN, which must not show.
+        fn new(lengths: &[usize], pixels: usize, channels: usize, end: [bool; 2], seed: u64, fill: Fill) -> Self {
+            let mut rng = Rng::new(seed);
+            let (first_channel, stride) = (3, channels + 5);
+            let mut ptr = vec![0];
+            ptr.extend(lengths.iter().scan(0, |sum, n| {
+                *sum += *n as u32;
+                Some(*sum)
+            }));
+            let col = (0..lengths.iter().sum()).map(|_| (rng.bits() % pixels as u64) as u32).collect();
+            let mut features = vec![f32::NAN; pixels * stride];
+            for pixel in features.chunks_exact_mut(stride) {
+                pixel[first_channel..][..channels].copy_from_slice(&fill(&mut rng, channels));
+            }
+            let bias = end[0].then(|| fill(&mut rng, channels));
+            Self { ptr, col, features, stride, first_channel, channels, bias, relu: end[1] }
+        }
+
+        fn args(&self) -> Gather<'_> {
+            Gather {
+                ptr: &self.ptr,
+                col: &self.col,
+                features: &self.features,
+                stride: self.stride,
+                first_channel: self.first_channel,
+                channels: self.channels,
+                bias: self.bias.as_deref(),
+                relu: self.relu,
+            }
+        }
+
+        fn rows(&self, isa: Isa, rows: Range<usize>) -> Vec<f32> {
+            let mut out = vec![f32::NAN; rows.len() * self.channels];
+            gather(isa, &self.args(), rows, &mut out);
+            out
+        }
+
+        fn all(&self, isa: Isa) -> Vec<f32> {
+            self.rows(isa, 0..self.ptr.len() - 1)
+        }
+
+        /// The same in f64 with a dense matrix, whose elements count how often a row reads a pixel.
+        fn naive(&self) -> Vec<f64> {
+            let (rows, pixels) = (self.ptr.len() - 1, self.features.len() / self.stride);
+            let mut matrix = vec![0.0; rows * pixels];
+            for row in 0..rows {
+                for at in self.ptr[row]..self.ptr[row + 1] {
+                    matrix[row * pixels + self.col[at as usize] as usize] += 1.0;
+                }
+            }
+            let mut out = Vec::new();
+            for (row, c) in (0..rows).flat_map(|row| (0..self.channels).map(move |c| (row, c))) {
+                let counts = &matrix[row * pixels..][..pixels];
+                let feature = |pixel: usize| f64::from(self.features[pixel * self.stride + self.first_channel + c]);
+                let sum: f64 = counts.iter().enumerate().map(|(pixel, count)| count * feature(pixel)).sum();
+                let mean = sum / counts.iter().sum::<f64>().max(1.0);
+                let value = mean + self.bias.as_ref().map_or(0.0, |bias| f64::from(bias[c]));
+                out.push(if self.relu { value.max(0.0) } else { value });
+            }
+            out
+        }
+    }
+
+    #[test]
+    fn by_hand() {
+        // Three pixels of which channels 1 and 2 are read; rows of two, no, one and three entries.
+        let features = [9.0, 1.0, 10.0, 9.0, 2.0, -20.0, 9.0, 6.0, 60.0];
+        let mut args = Gather {
+            ptr: &[0, 2, 2, 3, 6],
+            col: &[0, 1, 2, 2, 1, 1],
+            features: &features,
+            stride: 3,
+            first_channel: 1,
+            channels: 2,
+            bias: None,
+            relu: false,
+        };
+        for isa in Isa::available() {
+            let mut out = [f32::NAN; 8];
+            gather(isa, &args, 0..4, &mut out);
+            assert_eq!(out, [1.5, -5.0, 0.0, 0.0, 6.0, 60.0, 10.0 / 3.0, 20.0 / 3.0]);
+            (args.bias, args.relu) = (Some(&[-2.0, 1.0][..]), true);
+            gather(isa, &args, 1..3, &mut out[..4]);
+            assert_eq!(out[..4], [0.0, 1.0, 4.0, 61.0]);
+            (args.bias, args.relu) = (None, false);
+        }
+    }
+
+    #[test]
+    fn sums_ascend_from_zero() {
+        // 2^25 + 1 - 2^25 + 1 is 1 from the left; a lone -0 becomes 0 + -0 = 0.
+        let features: Vec<f32> = [33_554_432.0, 1.0, -33_554_432.0, -0.0].iter().flat_map(|x| [*x; 17]).collect();
+        let mut case = Case::new(&[4, 1], 4, 17, [false; 2], 0, Rng::ordinary);
+        (case.features, case.stride, case.first_channel, case.col) = (features, 17, 0, vec![0, 1, 2, 1, 3]);
+        for isa in Isa::available() {
+            let out = case.all(isa);
+            assert_same_bits(&out, &[[0.25; 17], [0.0; 17]].concat(), isa.name());
+        }
+    }
+
+    /// (row lengths, channels): channels around a vector and around four.
+    fn table() -> Vec<(Vec<usize>, usize)> {
+        let lengths = vec![3, 0, 1, 27, 0, 0, 128, 2, 5, 0];
+        let mut table: Vec<_> =
+            [1, 15, 16, 17, 27, 32, 33, 63, 64, 65, 80, 81, 128, 200].map(|c| (lengths.clone(), c)).into();
+        table.extend([(vec![], 16), (vec![0], 17), (vec![0; 9], 64), (vec![1], 64), (vec![4], 0)]);
+        table
+    }
+
+    #[test]
+    fn every_isa_gives_the_scalar_bits() {
+        let tally = Tally::default();
+        for (lengths, channels) in table() {
+            for end in [[false, false], [true, false], [false, true], [true, true]] {
+                let case = Case::new(&lengths, 40, channels, end, 3, Rng::wide);
+                let want = case.all(Isa::Scalar);
+                if end[0] && !end[1] && lengths.len() > 9 {
+                    // Four rows in ten are empty: all of those give the bias.
+                    tally.count(&want);
+                }
+                for isa in Isa::available() {
+                    assert_same_bits(&case.all(isa), &want, &format!("{} {lengths:?} {channels} {end:?}", isa.name()));
+                }
+            }
+        }
+        tally.assert_half();
+    }
+
+    #[test]
+    fn infinities_and_nan_come_out_where_the_scalar_code_has_them() {
+        for (lengths, channels) in table() {
+            let case = Case::new(&lengths, 40, channels, [true, true], 4, Rng::special);
+            let want = case.all(Isa::Scalar);
+            for isa in Isa::available() {
+                assert_same_bits(&case.all(isa), &want, &format!("{} {lengths:?} {channels}", isa.name()));
+            }
+        }
+        let want = Case::new(&[4; 30], 40, 40, [true, false], 4, Rng::special).all(Isa::Scalar);
+        assert_lively(&want, "four entries");
+        assert!(want.iter().any(|v| v.is_nan()) && want.iter().any(|v| v.is_infinite()), "nothing special came out");
+    }
+
+    #[test]
+    fn any_shape_and_any_split_gives_the_scalar_bits() {
+        let lengths = prop::collection::vec(prop_oneof![1 => Just(0usize), 6 => 1usize..40], 0..20);
+        let channels = prop_oneof![0usize..20, 60usize..70, 120usize..150];
+        let tally = Tally::default();
+        let run = |(lengths, pixels, channels, end, seed, split): (Vec<usize>, _, _, [bool; 2], u64, usize)| {
+            let case = Case::new(&lengths, pixels, channels, end, seed, Rng::wide);
+            let want = case.all(Isa::Scalar);
+            tally.count(&want);
+            for isa in Isa::available() {
+                assert_same_bits(&case.all(isa), &want, "whole");
+                let split = split % (lengths.len() + 1);
+                let parts = [case.rows(isa, 0..split), case.rows(isa, split..lengths.len())].concat();
+                assert_same_bits(&parts, &want, "in two parts");
+            }
+            Ok(())
+        };
+        let end = [0.5, 0.25].map(prop::bool::weighted);
+        let mut runner = TestRunner::new(Config::default());
+        runner.run(&(lengths, 1usize..300, channels, end, any::<u64>(), any::<usize>()), run).unwrap();
+        tally.assert_half();
+    }
+
+    #[test]
+    fn the_scalar_code_agrees_with_f64() {
+        for (lengths, channels) in table() {
+            for end in [[false, false], [true, true]] {
+                let case = Case::new(&lengths, 40, channels, end, 6, Rng::ordinary);
+                // 128 numbers below 1, then a division by 128: a few roundings of numbers below 1 remain.
+                assert_close(&case.all(Isa::Scalar), &case.naive(), 1e-6, &format!("{lengths:?} {channels}"));
+            }
+        }
+    }
+
+    /// A gather of four channels, broken in one place.
+    fn broken(isa: Isa, damage: impl FnOnce(&mut Case)) {
+        let mut case = Case::new(&[2, 0, 3], 10, 4, [true, false], 0, Rng::ordinary);
+        damage(&mut case);
+        case.all(isa);
+    }
+
+    #[test]
+    #[should_panic(expected = "channels out of range")]
+    fn channels_outside_the_pixel() {
+        broken(Isa::best(), |case| case.first_channel = 6);
+    }
+
+    #[test]
+    #[should_panic(expected = "channels out of range")]
+    fn a_first_channel_that_wraps() {
+        broken(Isa::best(), |case| case.first_channel = usize::MAX - 1);
+    }
+
+    #[test]
+    #[should_panic(expected = "the bias is shorter than the channels")]
+    fn short_bias() {
+        broken(Isa::best(), |case| case.bias = Some(vec![0.0; 3]));
+    }
+
+    #[test]
+    #[should_panic(expected = "rows 1..4 of 3")]
+    fn rows_outside() {
+        Case::new(&[2, 0, 3], 10, 4, [false; 2], 0, Rng::ordinary).rows(Isa::best(), 1..4);
+    }
+
+    #[test]
+    #[should_panic(expected = "rows 2..1 of 3")]
+    fn rows_backwards() {
+        Case::new(&[2, 0, 3], 10, 4, [false; 2], 0, Rng::ordinary).rows(Isa::best(), Range { start: 2, end: 1 });
+    }
+
+    #[test]
+    #[should_panic(expected = "the output does not hold the rows")]
+    fn short_output() {
+        let case = Case::new(&[2, 0, 3], 10, 4, [false; 2], 0, Rng::ordinary);
+        gather(Isa::best(), &case.args(), 0..3, &mut [0.0; 11]);
+    }
+
+    #[test]
+    #[should_panic(expected = "out of range")]
+    fn a_pixel_that_is_not_there() {
+        broken(Isa::best(), |case| case.col[4] = 10);
+    }
+
+    #[test]
+    #[should_panic(expected = "out of range")]
+    fn a_pixel_that_is_not_there_for_the_scalar_code() {
+        broken(Isa::Scalar, |case| case.col[4] = u32::MAX);
+    }
+
+    #[test]
+    #[should_panic(expected = "slice index starts at 2 but ends at 1")]
+    fn offsets_that_descend() {
+        broken(Isa::best(), |case| case.ptr[2] = 1);
+    }
+
+    #[test]
+    #[should_panic(expected = "out of range")]
+    fn offsets_beyond_the_entries() {
+        broken(Isa::best(), |case| case.ptr[3] = 6);
+    }
 }

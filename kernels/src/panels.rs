@@ -71,6 +71,8 @@ pub fn pack(depth: usize, columns: usize, w: impl Fn(usize, usize) -> f32, out: 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::isa::Isa;
+    use crate::simd::{Kernel, Simd, dispatch};
 
     #[test]
     fn every_element_has_its_own_place_and_the_rest_is_zero() {
@@ -84,5 +86,58 @@ mod tests {
             }
             assert_eq!(out.iter().filter(|&&v| v != 0.0).count(), depth * columns);
         }
+    }
+
+    #[test]
+    fn both_precisions_are_read_as_stored() {
+        let (wide, narrow) = ([1.5, -0.25], [f16::from_f32(1.5), f16::from_f32(-0.25)]);
+        for panels in [Panels::F32(&wide), Panels::F16(&narrow)] {
+            assert_eq!((panels.len(), panels.get(0), panels.get(1)), (2, 1.5, -0.25));
+            assert!(!panels.is_empty());
+        }
+        assert!(Panels::F32(&[]).is_empty() && Panels::F16(&[]).is_empty());
+    }
+
+    struct Widen<'a>(&'a [f16; LANES], &'a mut [f32; LANES]);
+
+    impl Kernel for Widen<'_> {
+        type Output = ();
+        fn reference(self) {
+            *self.1 = std::array::from_fn(|i| Panels::F16(self.0).get(i));
+        }
+        #[inline(always)]
+        fn run<S: Simd>(self, s: S) {
+            s.store(self.1, s.widen(self.0));
+        }
+    }
+
+    #[test]
+    fn every_half_precision_number_widens_to_the_same_bits() {
+        for isa in Isa::available() {
+            for first in (0..=u16::MAX).step_by(LANES) {
+                let narrow = std::array::from_fn(|i| f16::from_bits(first + i as u16));
+                let mut wide = [0.0; LANES];
+                dispatch(isa, Widen(&narrow, &mut wide));
+                for (bits, got) in (first..=u16::MAX).zip(wide) {
+                    // The number from its fields: sign, 5 bits of exponent, 10 of fraction.
+                    let (exponent, fraction) = (i32::from(bits >> 10 & 31), f64::from(bits & 1023) / 1024.0);
+                    let value = match exponent {
+                        0 => fraction * 2f64.powi(-14),
+                        31 if fraction == 0.0 => f64::INFINITY,
+                        31 => f64::NAN,
+                        _ => (1.0 + fraction) * 2f64.powi(exponent - 15),
+                    };
+                    let want = if bits >> 15 == 0 { value } else { -value } as f32;
+                    let same = got.to_bits() == want.to_bits() || (got.is_nan() && want.is_nan());
+                    assert!(same, "{}: {bits:04x} is {got:e}, not {want:e}", isa.name());
+                }
+            }
+        }
+    }
+
+    #[test]
+    #[should_panic(expected = "packed weights have another size")]
+    fn no_room_for_the_zero_columns() {
+        pack(2, 17, |_, _| 1.0, &mut [0.0; 34]);
     }
 }

@@ -15,9 +15,10 @@
 //! 3. One packed panel of a k block (16 KiB) stays in the first-level cache while all tiles of the row block use it.
 //! 4. Half-precision weights are widened once per panel, k block and row block.
 
-use crate::panels::{Panels, packed_len};
+use crate::panels::Panels;
 use crate::simd::{LANES, Simd, relu};
 use half::f16;
+use std::ops::Range;
 
 /// Rows of a tile.
 const TILE: usize = 6;
@@ -73,10 +74,26 @@ pub struct Product<'a> {
 
 impl Product<'_> {
     /// # Panics
-    /// If a slice is too short for the shape.
-    pub(crate) fn check(&self) {
-        assert_eq!(self.weights.len(), packed_len(self.depth, self.columns), "packed weights do not match the shape");
-        assert!(self.bias.len() >= self.columns.next_multiple_of(LANES), "the bias is shorter than the columns");
+    /// If a slice does not fit a product of `rows` rows, or the scratch is smaller than [`SCRATCH`].
+    pub(crate) fn check(&self, rows: usize, scratch: &[f32]) {
+        let padded = self.columns.checked_next_multiple_of(LANES).expect("the columns overflow");
+        assert_eq!(Some(self.weights.len()), padded.checked_mul(self.depth), "packed weights do not match the shape");
+        assert!(self.bias.len() >= padded, "the bias is shorter than the columns");
+        if let Residual::Before { rows: added, stride } | Residual::After { rows: added, stride } = self.residual {
+            assert!(added.len() >= span(rows, stride, self.columns), "the residual is shorter than the rows");
+        }
+        assert!(scratch.len() >= SCRATCH, "the scratch is too small");
+    }
+
+    /// [`Product::check`] for the rows `rows` of `total` that go to `out`, `stride` apart.
+    ///
+    /// # Panics
+    /// As [`Product::check`], and if `out` does not hold the rows.
+    pub(crate) fn check_rows(&self, rows: &Range<usize>, total: usize, stride: usize, out: &[f32], scratch: &[f32]) {
+        self.check(rows.end, scratch);
+        assert!(rows.start <= rows.end && rows.end <= total, "rows {rows:?} of {total}");
+        assert!(stride >= self.columns, "output rows overlap");
+        assert!(out.len() >= span(rows.len(), stride, self.columns), "the output is shorter than its rows");
     }
 
     /// The specification of one output: `a(k)` is the left row, `out` the number there before the call, `row` the row
@@ -101,12 +118,17 @@ impl Product<'_> {
     }
 }
 
+/// Numbers from the first of `rows` rows, `stride` apart, to the last one's end.
+fn span(rows: usize, stride: usize, columns: usize) -> usize {
+    rows.checked_sub(1).map_or(0, |before| before.saturating_mul(stride).saturating_add(columns))
+}
+
 /// The left matrix.
 pub(crate) trait Source {
     /// Writes the elements `k..k + piece.len()` of row `row` to `piece`.
     fn fill<S: Simd>(&self, s: S, row: usize, k: usize, piece: &mut [f32]);
 
-    /// The same elements where they lie in memory already, or `None` if they must be filled.
+    /// The same elements where they lie in memory already, or `None` if they must be filled: for all rows or for none.
     #[inline(always)]
     fn stored(&self, row: usize, k: usize, len: usize) -> Option<&[f32]> {
         let _ = (row, k, len);
@@ -146,7 +168,7 @@ pub(crate) fn product<S: Simd, A: Source, T: Target>(
     p: &Product<'_>,
     source: &A,
     target: &T,
-    rows: std::ops::Range<usize>,
+    rows: Range<usize>,
     out: &mut [f32],
     scratch: &mut [f32],
 ) {
@@ -297,3 +319,6 @@ fn multiply<S: Simd, const N: usize>(
     }
     sums
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,5 +1,9 @@
 //! What the kernels' tests share: numbers to compute with, and comparisons that name the place of a difference.
 
+use crate::panels::{Panels, pack, packed_len};
+use crate::product::{Product, Residual};
+use half::f16;
+
 /// A small generator (splitmix64), so that tests see the same numbers everywhere.
 pub(crate) struct Rng(u64);
 
@@ -93,4 +97,144 @@ pub(crate) fn pad_rows(x: &[f32], channels: usize, junk: f32) -> Vec<f32> {
         to[..channels].copy_from_slice(from);
     }
     out
+}
+
+/// Counts what a comparison compared, over many cases, so that it cannot pass by comparing nothing.
+#[derive(Default)]
+pub(crate) struct Tally {
+    outputs: std::cell::Cell<usize>,
+    telling: std::cell::Cell<usize>,
+}
+
+impl Tally {
+    /// Counts one case's outputs: those that are finite, each value once.
+    pub(crate) fn count(&self, outputs: &[f32]) {
+        let mut bits: Vec<u32> = outputs.iter().filter(|v| v.is_finite()).map(|v| v.to_bits()).collect();
+        bits.sort_unstable();
+        bits.dedup();
+        self.outputs.set(self.outputs.get() + outputs.len());
+        self.telling.set(self.telling.get() + bits.len());
+    }
+
+    /// Asserts that there were outputs, and that at least half of them were finite and distinct.
+    #[track_caller]
+    pub(crate) fn assert_half(&self) {
+        let (telling, outputs) = (self.telling.get(), self.outputs.get());
+        assert!(outputs > 0 && 2 * telling >= outputs, "only {telling} of {outputs} outputs were finite and distinct");
+    }
+}
+
+/// A [`Residual`] without its tensor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Joins {
+    Nowhere,
+    InPlace,
+    Before,
+    After,
+}
+
+/// Every place where a residual can join.
+pub(crate) const JOINS: [Joins; 4] = [Joins::Nowhere, Joins::InPlace, Joins::Before, Joins::After];
+
+/// All of a [`Product`] but its left matrix, owned.
+pub(crate) struct Owned {
+    pub(crate) depth: usize,
+    pub(crate) columns: usize,
+    pub(crate) relu: bool,
+    pub(crate) joins: Joins,
+    pub(crate) single: Vec<f32>,
+    pub(crate) half: Option<Vec<f16>>,
+    /// Padded with NaN, which must not show.
+    pub(crate) bias: Vec<f32>,
+    /// The tensor of the residual and the distance between its rows.
+    pub(crate) added: Vec<f32>,
+    pub(crate) added_stride: usize,
+}
+
+impl Owned {
+    /// Packs the weights w(k, n), which must be representable where `half` is asked for.
+    pub(crate) fn new(depth: usize, bias: &[f32], half: bool, w: impl Fn(usize, usize) -> f32) -> Self {
+        let columns = bias.len();
+        let mut single = vec![f32::NAN; packed_len(depth, columns)];
+        pack(depth, columns, w, &mut single);
+        let half = half.then(|| single.iter().map(|w| f16::from_f32(*w)).collect());
+        let bias = pad_rows(bias, columns.max(1), f32::NAN);
+        Self {
+            depth,
+            columns,
+            relu: false,
+            joins: Joins::Nowhere,
+            single,
+            half,
+            bias,
+            added: Vec::new(),
+            added_stride: 0,
+        }
+    }
+
+    /// The same with a residual for `rows` rows, `gap` numbers wider apart than need be, and with a rectifier or not.
+    pub(crate) fn end(mut self, rng: &mut Rng, fill: Fill, rows: usize, joins: Joins, gap: usize, relu: bool) -> Self {
+        self.joins = joins;
+        self.relu = relu;
+        self.added_stride = self.columns + gap;
+        self.added = fill(rng, rows * self.added_stride);
+        self
+    }
+
+    pub(crate) fn product(&self) -> Product<'_> {
+        let (rows, stride) = (&self.added[..], self.added_stride);
+        Product {
+            weights: self.half.as_ref().map_or(Panels::F32(&self.single), |w| Panels::F16(w)),
+            bias: &self.bias,
+            depth: self.depth,
+            columns: self.columns,
+            relu: self.relu,
+            residual: match self.joins {
+                Joins::Nowhere => Residual::None,
+                Joins::InPlace => Residual::InPlace,
+                Joins::Before => Residual::Before { rows, stride },
+                Joins::After => Residual::After { rows, stride },
+            },
+        }
+    }
+
+    /// What the formula makes of the exact sum of products of output (`row`, `n`), where `out` was before.
+    pub(crate) fn naive_end(&self, row: usize, n: usize, out: f32, sum: f64) -> f64 {
+        let added = |row: usize| f64::from(self.added[row * self.added_stride + n]);
+        let mut value = sum + f64::from(self.bias[n]);
+        match self.joins {
+            Joins::InPlace => value += f64::from(out),
+            Joins::Before => value += added(row),
+            _ => {}
+        }
+        if self.relu {
+            value = value.max(0.0);
+        }
+        if self.joins == Joins::After { value + added(row) } else { value }
+    }
+}
+
+/// The nearest half-precision numbers where `half` is asked for.
+pub(crate) fn round_to(half: bool, mut x: Vec<f32>) -> Vec<f32> {
+    if half {
+        x.iter_mut().for_each(|x| *x = f16::from_f32(*x).to_f32());
+    }
+    x
+}
+
+/// Runs `write` on `rows` rows of numbers, `stride` apart, which hold `before`. Returns what they hold afterwards, densely;
+/// the numbers in between must be left alone.
+pub(crate) fn write_rows(rows: usize, stride: usize, before: &[f32], write: impl FnOnce(&mut [f32])) -> Vec<f32> {
+    let gap = f32::from_bits(0x7fc0_0bad);
+    let columns = before.len().checked_div(rows).unwrap_or(0);
+    let mut out = vec![gap; rows * stride];
+    for row in 0..rows {
+        out[row * stride..][..columns].copy_from_slice(&before[row * columns..][..columns]);
+    }
+    let end = out.len().saturating_sub(stride - columns);
+    write(&mut out[..end]);
+    for (i, v) in out.iter().enumerate() {
+        assert!(i % stride < columns || v.to_bits() == gap.to_bits(), "number {i}, between rows, was written");
+    }
+    out.chunks(stride.max(1)).flat_map(|row| &row[..columns]).copied().collect()
 }
