@@ -41,8 +41,11 @@ impl Dump {
             None => known.clone(),
             Some(list) => list.split(',').map(|s| s.trim().to_owned()).collect(),
         };
-        if let Some(bad) = wanted.iter().find(|w| !known.contains(w)) {
-            let message = format!("--stages: no stage \"{bad}\", expected some of {}", known.join(", "));
+        let folded = Graph::build(network, true).rewritten(Rewrites::ALL);
+        let operations: Vec<&String> = full.operations.iter().chain(&folded.operations).map(|o| &o.name).collect();
+        if let Some(bad) = wanted.iter().find(|w| !known.contains(w) && !operations.contains(w)) {
+            let message =
+                format!("--stages: no stage \"{bad}\", expected an operation's name or some of {}", known.join(", "));
             return Err(Error::new(ErrorKind::Unsupported, message));
         }
         Ok(Self { wanted, stages: BTreeMap::new() })
@@ -69,7 +72,8 @@ impl Dump {
 
     /// Keeps the event's stage if it is wanted.
     pub fn observe(&mut self, graph: &Graph, event: &Event<'_>) {
-        let Some(name) = event.operation.stage.as_deref().filter(|name| self.wants(name)) else { return };
+        let names = [event.operation.stage.as_deref(), Some(event.operation.name.as_str())];
+        let Some(name) = names.into_iter().flatten().find(|name| self.wants(name)) else { return };
         let tensor = graph.tensor(event.operation.output);
         let stage = self.stages.entry(name.to_owned()).or_default();
         if matches!(event.operation.op, Op::Head { .. }) {
@@ -78,7 +82,7 @@ impl Dump {
             return;
         }
         let batch = event.camera.map_or(1, |camera| camera + 1);
-        let plane = tensor.extent[0] == 1 && (event.camera.is_some() || name.ends_with("bev") || is_plane(name));
+        let plane = tensor.extent[0] == 1 && (event.camera.is_some() || !is_volume(name));
         let extent = if plane { &tensor.extent[1..] } else { &tensor.extent[..] };
         stage.shape = [batch, tensor.channels].into_iter().chain(extent.iter().copied()).collect();
         stage.bytes.extend_from_slice(bytemuck::cast_slice(&channels_first(event.output, tensor.channels)));
@@ -114,9 +118,10 @@ impl Dump {
     }
 }
 
-/// Stages of the bird's-eye-view branch other than those called bev.
-fn is_plane(name: &str) -> bool {
-    name.ends_with(".attention") || name.ends_with(".aspp")
+/// Whether the result is a volume even when it is one voxel wide.
+fn is_volume(name: &str) -> bool {
+    let parts = ["volume", "fused", "conv3d", "up_sample", "refine", "combine_coeff"];
+    parts.iter().any(|part| name.contains(part))
 }
 
 /// `[rows, channels]` to `[channels, rows]`.
