@@ -1,0 +1,130 @@
+use super::*;
+use std::io::Cursor;
+
+fn floats() -> Vec<f32> {
+    vec![0.0, -0.0, 1.5, f32::MIN_POSITIVE / 8.0, f32::INFINITY, -2.25]
+}
+
+fn write_sample(path: &Path) {
+    let f = floats();
+    let arrays = [
+        Array { name: "classes", shape: &[2, 3, 2], elements: Elements::U8(&[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 255]) },
+        Array { name: "logits", shape: &[6], elements: Elements::F32(&f) },
+        Array { name: "scalar", shape: &[], elements: Elements::F32(&f[2..3]) },
+        Array { name: "none", shape: &[0, 4], elements: Elements::U8(&[]) },
+    ];
+    write_npz(path, &arrays).unwrap();
+}
+
+fn sample() -> Vec<u8> {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.npz");
+    write_sample(&path);
+    std::fs::read(path).unwrap()
+}
+
+fn read(bytes: &[u8]) -> Result<Vec<OwnedArray>> {
+    read_from(Cursor::new(bytes), bytes.len() as u64)
+}
+
+#[test]
+fn round_trip_keeps_names_order_shapes_and_bits() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.npz");
+    write_sample(&path);
+    let arrays = read_npz(&path).unwrap();
+    let names: Vec<_> = arrays.iter().map(|a| (a.name.as_str(), a.shape.as_slice())).collect();
+    assert_eq!(names, [("classes", &[2, 3, 2][..]), ("logits", &[6]), ("scalar", &[]), ("none", &[0, 4])]);
+    assert_eq!(arrays[0].elements, OwnedElements::U8(vec![0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 255]));
+    let OwnedElements::F32(found) = &arrays[1].elements else { panic!("expected floats") };
+    let bits = |v: &[f32]| v.iter().map(|f| f.to_bits()).collect::<Vec<_>>();
+    assert_eq!(bits(found), bits(&floats()));
+    assert_eq!(sample(), sample(), "equal arrays give equal files");
+}
+
+#[test]
+fn header_is_what_numpy_writes() {
+    let header = npy_header("|u1", &[200, 200, 16]);
+    assert_eq!(header.len(), 128);
+    assert!(
+        header.starts_with(
+            b"\x93NUMPY\x01\x00\x76\x00{'descr': '|u1', 'fortran_order': False, 'shape': (200, 200, 16), }"
+        )
+    );
+    assert_eq!(header.last(), Some(&b'\n'));
+    assert!(String::from_utf8_lossy(&npy_header("<f4", &[7])[10..]).contains("'shape': (7,), }"));
+    assert!(String::from_utf8_lossy(&npy_header("<f4", &[])[10..]).contains("'shape': (), }"));
+}
+
+#[test]
+fn every_truncation_is_an_error() {
+    let bytes = sample();
+    for length in 0..bytes.len() {
+        assert!(read(&bytes[..length]).is_err(), "{length} of {} bytes were accepted", bytes.len());
+    }
+}
+
+#[test]
+fn every_corrupted_byte_is_an_error_or_harmless() {
+    let bytes = sample();
+    let whole = read(&bytes).unwrap();
+    let mut refused = 0;
+    for at in 0..bytes.len() {
+        let mut corrupt = bytes.clone();
+        corrupt[at] ^= 0xff;
+        match read(&corrupt) {
+            Err(_) => refused += 1,
+            // What a zip says twice, such as times and versions, may be wrong in one place; elements may not.
+            Ok(arrays) => assert!(
+                arrays.iter().zip(&whole).all(|(a, b)| a.elements == b.elements && a.shape == b.shape),
+                "byte {at} changed the arrays unseen"
+            ),
+        }
+    }
+    assert!(refused > bytes.len() / 3, "only {refused} of {} corruptions were refused", bytes.len());
+}
+
+#[test]
+fn headers_that_lie_are_refused() {
+    for (literal, size, expected) in [
+        ("{'descr': '<f4', 'fortran_order': False, 'shape': (2,), }", 4, "expected shape [2] of 4 bytes"),
+        ("{'descr': '<f8', 'fortran_order': False, 'shape': (1,), }", 8, "type \"<f8\""),
+        ("{'descr': '<f4', 'fortran_order': True, 'shape': (1,), }", 4, "Fortran order"),
+        ("{'descr': '|u1', 'fortran_order': False, 'shape': (18446744073709551615, 2), }", 4, "expected shape"),
+        ("{'descr': '|u1', 'fortran_order': False, 'shape': (-1,), }", 4, "expected descr"),
+        ("{'descr': '|u1', 'fortran_order': False, 'shape': 4, }", 4, "expected descr"),
+        ("{'descr': '|u1', 'fortran_order': False}", 4, "expected descr"),
+        ("{'descr': [('a', '|u1')], 'fortran_order': False, 'shape': (4,), }", 4, "expected descr"),
+        ("", 4, "expected descr"),
+    ] {
+        let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+        bytes.extend((literal.len() as u16).to_le_bytes());
+        bytes.extend(literal.as_bytes());
+        bytes.extend(vec![0u8; size]);
+        let total = bytes.len() as u64;
+        let error = read_array(&mut Cursor::new(bytes), total).unwrap_err();
+        assert!(error.message().contains(expected), "{literal}: {error}");
+    }
+    let error = read_array(&mut Cursor::new(b"\x93NUMPY\x02\x00\xff\xff\xff\x7f"), 12).unwrap_err();
+    assert!(error.message().contains("header of 2147483647 bytes"), "{error}");
+    assert!(read_array(&mut Cursor::new(b"\x93NUMPY\x09\x00"), 8).is_err());
+}
+
+#[test]
+fn arrays_that_cannot_be_written_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("a.npz");
+    let array = |name, shape| Array { name, shape, elements: Elements::U8(&[1, 2, 3]) };
+    for arrays in [
+        &[array("", &[3])][..],
+        &[array("a/b", &[3])],
+        &[array("a\nb", &[3])],
+        &[array("a", &[2])],
+        &[array("a", &[usize::MAX, 3])],
+        &[array("a", &[3]), array("a", &[3])],
+    ] {
+        let error = write_npz(&path, arrays).unwrap_err();
+        assert_eq!((error.kind(), error.path()), (ErrorKind::Format, Some(path.as_path())));
+        assert!(!path.exists());
+    }
+}
