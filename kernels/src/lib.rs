@@ -1,1 +1,3 @@
 //! The arithmetic of voxcast.
+
+pub mod project;

@@ -1,0 +1,382 @@
+//! Sample points to feature pixels of one camera.
+//!
+//! ```text
+//! for each x in xs, each y in ys, each z in zs:
+//!     p[r]  = matrix[r] . (x, y, z, 1)          for r in 0..3, in the order that `Sum` names
+//!     u, v  = p[0] / p[2], p[1] / p[2]
+//!     valid = 0 <= u <= width - 1  and  0 <= v <= height - 1  and  p[2] >= 0
+//!     out   = base + floor(v / stride) * (width / stride) + floor(u / stride)   if valid, else 0
+//! ```
+//!
+//! Flat pixel 0 never counts in a projection matrix, so 0 doubles as the mark of a sample that hits nothing. NaN fails
+//! every comparison and so is invalid. Strides are powers of two: dividing a coordinate by one is exact, hence
+//! `floor(u / stride)` is a shift of the integer part.
+//!
+//! The AVX2 body computes eight z at once, the terms of x and y once per line, and ends lines that are no multiple of
+//! eight with the specification.
+
+/// Rounding of the products: in which order, and with which roundings, a row is multiplied with a point.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Sum {
+    /// `fma(m2, z, fma(m1, y, m0 * x)) + m3`: one chain, ascending.
+    Chain,
+    /// `(m0 * x + m2 * z) + (m1 * y + m3)`, every operation rounded. The published code's matrix product takes this
+    /// order for a single camera, where its left operand has only one matrix's rows.
+    Pairs,
+}
+
+/// One camera's projection onto the flat feature pixels of one level.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Projection {
+    /// The first three rows of lidar2img, row-major: lidar-frame metres to (u * d, v * d, d) in image pixels.
+    pub matrix: [f32; 12],
+    /// How a row is summed.
+    pub sum: Sum,
+    /// Pixels per row of the padded image, a multiple of the stride.
+    pub width: u32,
+    /// Rows of the padded image, a multiple of the stride.
+    pub height: u32,
+    /// Image pixels per feature pixel and axis, as a power of two: 3 for stride 8.
+    pub stride_log2: u32,
+    /// Flat index of this camera's first feature pixel.
+    pub base: u32,
+}
+
+impl Projection {
+    /// Every rule that the arithmetic relies on.
+    fn check(&self, points: [usize; 3], out: &[u32]) {
+        let samples = points[0].checked_mul(points[1]).and_then(|v| v.checked_mul(points[2]));
+        assert_eq!(samples, Some(out.len()), "out holds one pixel per sample point");
+        assert!(self.stride_log2 < 16, "stride is at most 2^15");
+        let stride = 1 << self.stride_log2;
+        for size in [self.width, self.height] {
+            assert!(
+                size > 0 && size <= 1 << 20 && size % stride == 0,
+                "image of 1 to 2^20 pixels, a multiple of the stride"
+            );
+        }
+        let pixels = u64::from(self.width / stride) * u64::from(self.height / stride);
+        assert!(u64::from(self.base) + pixels <= 1 << 32, "flat pixels fit 32 bits");
+    }
+
+    fn dot(&self, row: usize, x: f32, y: f32, z: f32) -> f32 {
+        let [m0, m1, m2, m3] = [0, 1, 2, 3].map(|k| self.matrix[row * 4 + k]);
+        match self.sum {
+            Sum::Chain => z.mul_add(m2, y.mul_add(m1, m0 * x)) + m3,
+            Sum::Pairs => (m0 * x + m2 * z) + (m1 * y + m3),
+        }
+    }
+
+    /// The flat pixel that a point hits, or 0.
+    fn pixel(&self, x: f32, y: f32, z: f32) -> u32 {
+        let d = self.dot(2, x, y, z);
+        let u = self.dot(0, x, y, z) / d;
+        let v = self.dot(1, x, y, z) / d;
+        let inside = |t: f32, size: u32| t >= 0.0 && t <= (size - 1) as f32;
+        if inside(u, self.width) && inside(v, self.height) && d >= 0.0 {
+            let s = self.stride_log2;
+            self.base + (v as u32 >> s) * (self.width >> s) + (u as u32 >> s)
+        } else {
+            0
+        }
+    }
+}
+
+/// The specification. Writes `out[(i * ys.len() + j) * zs.len() + k]` for point (xs\[i\], ys\[j\], zs\[k\]): its flat
+/// pixel, or 0 where it hits none. Returns whether any point hits one.
+///
+/// # Panics
+/// If `out` does not hold one element per point, or `p` breaks a rule of its fields.
+pub fn project_points_reference(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
+    p.check([xs.len(), ys.len(), zs.len()], out);
+    let mut any = 0;
+    let mut at = 0;
+    for &x in xs {
+        for &y in ys {
+            for &z in zs {
+                out[at] = p.pixel(x, y, z);
+                any |= out[at];
+                at += 1;
+            }
+        }
+    }
+    any != 0
+}
+
+#[cfg(target_arch = "x86_64")]
+pub use avx2::project_points_avx2;
+
+#[cfg(target_arch = "x86_64")]
+mod avx2 {
+    use super::{Projection, Sum};
+    use std::arch::x86_64::*;
+
+    /// The constants of a camera, one per lane.
+    struct Lanes {
+        width: __m256,
+        height: __m256,
+        pixels_per_row: __m256i,
+        base: __m256i,
+        shift: __m128i,
+    }
+
+    /// [`project_points_reference`](super::project_points_reference), eight points at a time and equal to it in every
+    /// bit.
+    ///
+    /// # Panics
+    /// As the specification.
+    ///
+    /// # Safety
+    /// The CPU must have AVX2 and FMA.
+    #[target_feature(enable = "avx2,fma")]
+    pub fn project_points_avx2(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
+        p.check([xs.len(), ys.len(), zs.len()], out);
+        match p.sum {
+            Sum::Chain => lines::<false>(p, xs, ys, zs, out),
+            Sum::Pairs => lines::<true>(p, xs, ys, zs, out),
+        }
+    }
+
+    #[target_feature(enable = "avx2,fma")]
+    fn lines<const PAIRS: bool>(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
+        let lanes = Lanes {
+            width: _mm256_set1_ps((p.width - 1) as f32),
+            height: _mm256_set1_ps((p.height - 1) as f32),
+            pixels_per_row: _mm256_set1_epi32((p.width >> p.stride_log2) as i32),
+            base: _mm256_set1_epi32(p.base as i32),
+            shift: _mm_cvtsi32_si128(p.stride_log2 as i32),
+        };
+        let slope: [__m256; 3] = std::array::from_fn(|r| _mm256_set1_ps(p.matrix[r * 4 + 2]));
+        let whole = zs.len() - zs.len() % 8;
+        let mut any = _mm256_setzero_si256();
+        let mut any_tail = 0;
+        let mut rest = out;
+        for &x in xs {
+            for &y in ys {
+                let line;
+                (line, rest) = rest.split_at_mut(zs.len());
+                // PAIRS: (first + slope * z) + second; else fma(slope, z, first) + second.
+                let (first, second) = line_terms::<PAIRS>(p, x, y);
+                for (z, out) in zs.chunks_exact(8).zip(line.chunks_exact_mut(8)) {
+                    // SAFETY: `chunks_exact(8)` yields 8 floats; the load needs no alignment.
+                    let z = unsafe { _mm256_loadu_ps(z.as_ptr()) };
+                    let dots: [__m256; 3] = std::array::from_fn(|r| {
+                        let head = if PAIRS {
+                            _mm256_add_ps(first[r], _mm256_mul_ps(slope[r], z))
+                        } else {
+                            _mm256_fmadd_ps(slope[r], z, first[r])
+                        };
+                        _mm256_add_ps(head, second[r])
+                    });
+                    let pixel = pixels(&lanes, dots);
+                    any = _mm256_or_si256(any, pixel);
+                    // SAFETY: `chunks_exact_mut(8)` yields 8 u32; the store needs no alignment.
+                    unsafe { _mm256_storeu_si256(out.as_mut_ptr().cast(), pixel) };
+                }
+                for (&z, out) in zs[whole..].iter().zip(&mut line[whole..]) {
+                    *out = p.pixel(x, y, z);
+                    any_tail |= *out;
+                }
+            }
+        }
+        any_tail != 0 || _mm256_testz_si256(any, any) == 0
+    }
+
+    /// What a line of constant x and y adds before and after the term of z.
+    #[target_feature(enable = "avx2,fma")]
+    fn line_terms<const PAIRS: bool>(p: &Projection, x: f32, y: f32) -> ([__m256; 3], [__m256; 3]) {
+        let row = |r: usize| &p.matrix[r * 4..r * 4 + 4];
+        let first = std::array::from_fn(|r| {
+            let m = row(r);
+            _mm256_set1_ps(if PAIRS { m[0] * x } else { y.mul_add(m[1], m[0] * x) })
+        });
+        let second = std::array::from_fn(|r| {
+            let m = row(r);
+            _mm256_set1_ps(if PAIRS { m[1] * y + m[3] } else { m[3] })
+        });
+        (first, second)
+    }
+
+    /// Products of eight points to flat pixels; 0 where invalid.
+    #[target_feature(enable = "avx2,fma")]
+    fn pixels(lanes: &Lanes, [u, v, d]: [__m256; 3]) -> __m256i {
+        let zero = _mm256_setzero_ps();
+        let u = _mm256_div_ps(u, d);
+        let v = _mm256_div_ps(v, d);
+        // Ordered comparisons: NaN is false.
+        let in_u = _mm256_and_ps(_mm256_cmp_ps::<_CMP_GE_OQ>(u, zero), _mm256_cmp_ps::<_CMP_LE_OQ>(u, lanes.width));
+        let in_v = _mm256_and_ps(_mm256_cmp_ps::<_CMP_GE_OQ>(v, zero), _mm256_cmp_ps::<_CMP_LE_OQ>(v, lanes.height));
+        let ahead = _mm256_cmp_ps::<_CMP_GE_OQ>(d, zero);
+        let valid = _mm256_castps_si256(_mm256_and_ps(ahead, _mm256_and_ps(in_u, in_v)));
+        // Lanes that are not valid convert to anything; the mask drops them.
+        let u = _mm256_srl_epi32(_mm256_cvttps_epi32(u), lanes.shift);
+        let v = _mm256_srl_epi32(_mm256_cvttps_epi32(v), lanes.shift);
+        let flat = _mm256_add_epi32(_mm256_add_epi32(_mm256_mullo_epi32(v, lanes.pixels_per_row), u), lanes.base);
+        _mm256_and_si256(flat, valid)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Pinhole at the origin that looks along z: u = 16 + 16 x / z, v = 16 + 16 y / z.
+    fn pinhole() -> Projection {
+        Projection {
+            matrix: [16.0, 0.0, 16.0, 0.0, 0.0, 16.0, 16.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+            sum: Sum::Chain,
+            width: 64,
+            height: 32,
+            stride_log2: 3,
+            base: 100,
+        }
+    }
+
+    fn one(p: &Projection, [x, y, z]: [f32; 3]) -> u32 {
+        let mut out = [7];
+        let any = project_points_reference(p, &[x], &[y], &[z], &mut out);
+        assert_eq!(any, out[0] != 0);
+        out[0]
+    }
+
+    #[test]
+    fn pinhole_by_hand() {
+        let p = pinhole();
+        for (point, expected, why) in [
+            ([0.0, 0.0, 1.0], 100 + 2 * 8 + 2, "the axis: u = v = 16"),
+            ([-1.0, -1.0, 1.0], 100, "the first pixel: u = v = 0"),
+            ([2.9375, 0.9375, 1.0], 100 + 3 * 8 + 7, "u = 63, v = 31 are the last that count"),
+            ([2.94, 0.0, 1.0], 0, "u = 63.04"),
+            ([0.0, 0.94, 1.0], 0, "v = 31.04"),
+            ([-1.001, 0.0, 1.0], 0, "u < 0"),
+            ([0.0, 0.0, -1.0], 0, "behind: u = v = 16 but d = -1"),
+            ([0.0, 0.0, 0.0], 0, "0 / 0"),
+            ([1.0, 1.0, 0.0], 0, "infinite"),
+            ([0.0, 0.0, f32::NAN], 0, "NaN"),
+            ([0.0, f32::INFINITY, 1.0], 0, "infinite v"),
+        ] {
+            assert_eq!(one(&p, point), expected, "{why}");
+        }
+    }
+
+    #[test]
+    fn flat_pixel_zero_counts_as_none() {
+        let first = Projection { base: 0, ..pinhole() };
+        assert_eq!(one(&first, [-1.0, -1.0, 1.0]), 0);
+        assert_eq!(one(&first, [-0.5, -1.0, 1.0]), 1);
+    }
+
+    #[test]
+    fn sums_round_as_they_say() {
+        let mut p = pinhole();
+        // 1 + 2^-12 squared is 1 + 2^-11 + 2^-24: the fused sum keeps the last term, the rounded product drops it.
+        let e = 1.0 + 1.0 / 4096.0;
+        p.matrix[..4].copy_from_slice(&[-1.0, 0.0, e, 0.0]);
+        assert_eq!(p.dot(0, 1.0, 0.0, e), 1.0 / 2048.0 + 1.0 / 16_777_216.0, "fused");
+        p.sum = Sum::Pairs;
+        assert_eq!(p.dot(0, 1.0, 0.0, e), 1.0 / 2048.0, "product rounded first");
+        // Pairs adds m0 x to m2 z before anything else: 2^25 - 2^25 is exactly 0, and the 1s survive.
+        p.matrix[..4].copy_from_slice(&[33_554_432.0, 1.0, -33_554_432.0, 1.0]);
+        assert_eq!(p.dot(0, 1.0, 1.0, 1.0), 2.0);
+        p.sum = Sum::Chain;
+        assert_eq!(p.dot(0, 1.0, 1.0, 1.0), 1.0, "the chain loses the first 1 in 2^25 + 1");
+    }
+
+    #[test]
+    #[should_panic(expected = "one pixel per sample point")]
+    fn short_output_is_refused() {
+        project_points_reference(&pinhole(), &[0.0], &[0.0], &[1.0, 2.0], &mut [0]);
+    }
+
+    #[test]
+    #[should_panic(expected = "flat pixels fit 32 bits")]
+    fn overflowing_base_is_refused() {
+        let p = Projection { base: u32::MAX - 30, ..pinhole() };
+        project_points_reference(&p, &[0.0], &[0.0], &[1.0], &mut [0]);
+    }
+
+    #[test]
+    #[should_panic(expected = "a multiple of the stride")]
+    fn ragged_image_is_refused() {
+        let p = Projection { width: 60, ..pinhole() };
+        project_points_reference(&p, &[0.0], &[0.0], &[1.0], &mut [0]);
+    }
+
+    fn number() -> impl Strategy<Value = f32> {
+        prop_oneof![
+            12 => -60.0f32..60.0,
+            1 => Just(0.0f32),
+            1 => Just(-0.0f32),
+            1 => prop::num::f32::ANY,
+        ]
+    }
+
+    fn projections() -> impl Strategy<Value = Projection> {
+        let plausible =
+            (number(), number(), number(), -3.2f32..3.2, 20.0f32..300.0).prop_map(|(x, y, z, yaw, focal)| {
+                let (s, c) = yaw.sin_cos();
+                let rows = [[s, -c, 0.0, x / 50.0], [0.0, 0.0, -1.0, y / 50.0], [c, s, 0.0, z / 50.0]];
+                let image = |r: usize, centre: f32| {
+                    std::array::from_fn::<_, 4, _>(|k| focal * rows[r][k] + centre * rows[2][k])
+                };
+                [image(0, 160.0), image(1, 96.0), rows[2]].concat().try_into().unwrap()
+            });
+        let wild = prop::array::uniform12(number());
+        (prop_oneof![3 => plausible, 1 => wild], any::<bool>(), 3u32..6, 1u32..12, 1u32..12, 0u32..1000).prop_map(
+            |(matrix, pairs, stride_log2, w, h, base)| Projection {
+                matrix,
+                sum: if pairs { Sum::Pairs } else { Sum::Chain },
+                width: w * 32,
+                height: h * 32,
+                stride_log2,
+                base,
+            },
+        )
+    }
+
+    proptest! {
+        #[test]
+        fn pixels_are_in_range(p in projections(), x in number(), y in number(), z in number()) {
+            let pixel = one(&p, [x, y, z]);
+            let last = p.base + (p.width >> p.stride_log2) * (p.height >> p.stride_log2);
+            prop_assert!(pixel == 0 || (p.base..last).contains(&pixel));
+        }
+
+        #[cfg(target_arch = "x86_64")]
+        #[test]
+        fn avx2_is_the_specification(
+            p in projections(),
+            xs in prop::collection::vec(number(), 0..4),
+            ys in prop::collection::vec(number(), 0..4),
+            zs in prop::collection::vec(number(), 0..35),
+        ) {
+            assert!(is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"), "this test needs AVX2 and FMA");
+            let mut expected = vec![1; xs.len() * ys.len() * zs.len()];
+            let mut found = vec![2; expected.len()];
+            let any = project_points_reference(&p, &xs, &ys, &zs, &mut expected);
+            // SAFETY: the assertion above saw both features.
+            let any_avx2 = unsafe { project_points_avx2(&p, &xs, &ys, &zs, &mut found) };
+            prop_assert_eq!(any, any_avx2);
+            prop_assert_eq!(expected, found);
+        }
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[test]
+    fn avx2_is_the_specification_where_most_points_hit() {
+        assert!(is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"), "this test needs AVX2 and FMA");
+        let axis: Vec<f32> = (0..61).map(|i| -1.0 + i as f32 * 0.07).collect();
+        for sum in [Sum::Chain, Sum::Pairs] {
+            let p = Projection { sum, ..pinhole() };
+            let mut expected = vec![0; axis.len().pow(3)];
+            let mut found = expected.clone();
+            project_points_reference(&p, &axis, &axis, &axis, &mut expected);
+            // SAFETY: the assertion above saw both features.
+            unsafe { project_points_avx2(&p, &axis, &axis, &axis, &mut found) };
+            assert_eq!(expected, found);
+            let hits = expected.iter().filter(|&&v| v != 0).count();
+            assert!(hits * 5 > expected.len(), "{hits} of {} hit", expected.len());
+        }
+    }
+}
