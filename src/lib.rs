@@ -1,5 +1,6 @@
 //! voxcast turns a ring of camera images into a semantic voxel grid on a plain CPU.
 
+pub mod camera;
 pub mod container;
 pub mod error;
 pub mod network;
