@@ -308,6 +308,11 @@ impl Container {
         Some((info.dtype, &info.shape, &self.bytes[self.start + from..self.start + to]))
     }
 
+    /// The bytes of the whole file.
+    pub fn bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+
     /// Names of the tensors, in the order of their data.
     pub fn names(&self) -> Vec<String> {
         self.header.offset_keys()
@@ -321,11 +326,6 @@ impl Container {
     /// The checksum, which was found right; `None` for a file that has none.
     pub fn checksum(&self) -> Option<u64> {
         self.checksum
-    }
-
-    /// Bytes of the whole file.
-    pub fn file_size(&self) -> usize {
-        self.bytes.len()
     }
 }
 
@@ -419,7 +419,7 @@ mod tests {
         assert_eq!(c.metadata()["note"], metadata()["note"]);
         assert_eq!(c.metadata()[CHECKSUM], format!("xxh3-64:{:016x}", c.checksum().unwrap()));
         let bytes = fs::read(&path).unwrap();
-        assert_eq!(c.file_size(), bytes.len());
+        assert_eq!(c.bytes(), bytes);
         assert!(safetensors::SafeTensors::deserialize(&bytes).is_ok(), "the reference reader takes it");
         sample(&path).unwrap();
         assert_eq!(fs::read(&path).unwrap(), bytes, "the same arguments give the same bytes");

@@ -125,6 +125,9 @@ mod avx2 {
     ///
     /// # Panics
     /// As the specification.
+    ///
+    /// # Safety
+    /// The CPU must have AVX2 and FMA.
     #[target_feature(enable = "avx2,fma")]
     pub fn project_points_avx2(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
         p.check([xs.len(), ys.len(), zs.len()], out);
