@@ -4,13 +4,13 @@
 //! out[row][n] = end(start(n) + a[row][0] * w[0][n] + a[row][1] * w[1][n] + ...)      one fma chain, k ascending
 //! ```
 //!
-//! The left matrix `a` is not stored: a [`Source`] copies (or samples) a piece of one row at a time into a block that
+//! The left matrix `a` is not stored: a `Source` copies (or samples) a piece of one row at a time into a block that
 //! stays in the second-level cache. The right matrix is packed ([`crate::panels`]).
 //!
 //! What the body changes relative to the formula, none of which can change a bit:
-//! 1. Rows go in blocks of [`ROWS`], k in blocks of [`DEPTH`]. Between k blocks the partial sums wait in `out`, and the
+//! 1. Rows go in blocks of `ROWS`, k in blocks of `DEPTH`. Between k blocks the partial sums wait in `out`, and the
 //!    next block's chain starts from them.
-//! 2. Inside, tiles of [`TILE`] rows by 16 columns live in registers: 12 accumulators of 8 lanes, 2 registers of
+//! 2. Inside, tiles of `TILE` rows by 16 columns live in registers: 12 accumulators of 8 lanes, 2 registers of
 //!    weights and broadcasts of `a`. That is the largest tile that AVX2's 16 registers hold without spilling.
 //! 3. One packed panel of a k block (16 KiB) stays in the first-level cache while all tiles of the row block use it.
 //! 4. Half-precision weights are widened once per panel, k block and row block.
@@ -22,7 +22,7 @@ use std::ops::Range;
 
 /// Rows of a tile.
 const TILE: usize = 6;
-/// Rows of a block: with [`DEPTH`] numbers each they take about a fifth of a 512 KiB second-level cache.
+/// Rows of a block: with `DEPTH` numbers each they take about a fifth of a 512 KiB second-level cache.
 pub(crate) const ROWS: usize = 96;
 /// Numbers of k per block.
 const DEPTH: usize = 256;
