@@ -68,7 +68,9 @@ impl Demo {
         let picture = run::draw(model.network(), &scene, &result, "voxcast demo", &subtitle)?;
         picture.write_png(&directory.join("occupancy.png"))?;
         let d = directory.display();
-        println!("see {d}/occupancy.png; the same again: voxcast run --model {d}/model.safetensors {d}/scene -o out.npz");
+        println!(
+            "see {d}/occupancy.png; the same again: voxcast run --model {d}/model.safetensors {d}/scene -o out.npz"
+        );
         Ok(())
     }
 }

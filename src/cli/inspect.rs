@@ -52,7 +52,9 @@ impl Inspect {
         let memory = Session::memory(&model, cameras, &options)?;
         let parameters: usize = model.tensors().map(|(_, _, len)| len).sum();
         let multiply_adds: u64 = (0..graph.operations.len())
-            .map(|i| graph.multiply_adds(&graph.operations[i]) * if i < graph.camera_operations { cameras as u64 } else { 1 })
+            .map(|i| {
+                graph.multiply_adds(&graph.operations[i]) * if i < graph.camera_operations { cameras as u64 } else { 1 }
+            })
             .sum();
         let rewrites = model.options().rewrites;
         if self.json {

@@ -128,7 +128,8 @@ pub fn draw(
     subtitle: &str,
 ) -> Result<picture::Picture> {
     let palette = Palette::of(network.classes);
-    let occupancy = picture::Occupancy::new("occupancy", result.classes, result.grid, network.bounds, forward_of(&network.bounds))?;
+    let occupancy =
+        picture::Occupancy::new("occupancy", result.classes, result.grid, network.bounds, forward_of(&network.bounds))?;
     let images: Vec<_> = scene.names.iter().map(String::as_str).zip(&scene.images).collect();
     Ok(picture::draw(&Figure { title, subtitle, images: &images, occupancies: &[occupancy], palette: &palette }))
 }
