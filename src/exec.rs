@@ -23,8 +23,10 @@ use voxcast_kernels::upsample_add::{UpsampleAdd, upsample_add};
 use voxcast_kernels::window_attention::{WindowAttention, window_attention};
 use voxcast_kernels::{Isa, Panels};
 
-/// Rows of a convolution that one worker takes at a time: one block of the product kernel.
+/// Most rows of a convolution that one worker takes at a time: one block of the product kernel.
 const CONV_ROWS: usize = 96;
+/// Rows that the product kernel computes at once.
+const CONV_TILE: usize = 6;
 /// Voxels or cells that one worker gathers at a time.
 const GATHER_ROWS: usize = 500;
 /// Voxels that one worker classifies at a time.
@@ -371,8 +373,11 @@ impl Context<'_> {
         let stride = self.graph.tensor(operation.output).channels;
         let start = self.range(operation.output, camera).start + operation.first_channel;
         let rows = geometry.rows();
-        for_each_tile(self.plan.workers(), rows.div_ceil(CONV_ROWS), &|worker, tile| {
-            let rows = tile * CONV_ROWS..rows.min((tile + 1) * CONV_ROWS);
+        // As many tiles as blocks of rows, but the same number for every worker.
+        let tiles = rows.div_ceil(CONV_ROWS).next_multiple_of(self.plan.workers());
+        let per_tile = rows.div_ceil(tiles).next_multiple_of(CONV_TILE);
+        for_each_tile(self.plan.workers(), rows.div_ceil(per_tile), &|worker, tile| {
+            let rows = tile * per_tile..rows.min((tile + 1) * per_tile);
             let place = start + rows.start * stride..start + (rows.end - 1) * stride + operation.channels;
             // SAFETY: each tile has its own rows, and each worker its own scratch; `check` found both apart from
             // everything that is read.
