@@ -271,7 +271,8 @@ impl Context<'_> {
 
     fn normalise(&self, view: View<'_>, operation: &Operation, call: &Call<'_>) {
         let [_, height, width] = self.graph.tensor(operation.output).extent;
-        let ImageView { height: image_height, width: image_width, bgr } = call.image.expect("the pass of a camera has its image");
+        let ImageView { height: image_height, width: image_width, bgr } =
+            call.image.expect("the pass of a camera has its image");
         self.lines(view, operation, call.camera, height, &|rows, out, _| {
             normalise(bgr, image_height, image_width, width, rows.start, out);
         });

@@ -311,7 +311,8 @@ impl Importer<'_> {
     /// A batch norm as scale and shift.
     fn norm(&self, prefix: &str, channels: usize) -> Result<(Vec<f64>, Vec<f64>)> {
         let part = |name: &str| self.tensor(&format!("{prefix}.{name}"), &[channels]);
-        let (gamma, beta, mean, variance) = (part("weight")?, part("bias")?, part("running_mean")?, part("running_var")?);
+        let (gamma, beta, mean, variance) =
+            (part("weight")?, part("bias")?, part("running_mean")?, part("running_var")?);
         if let Some(i) = variance.iter().position(|&v| v < 0.0) {
             return Err(Error::format(format!(
                 "tensor \"{prefix}.running_var\": element [{i}] is {}, expected a variance of at least 0",

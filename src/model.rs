@@ -66,11 +66,9 @@ impl Model {
 
     fn new(container: Container) -> Result<Self> {
         let get = |key: &str| {
-            container
-                .metadata()
-                .get(key)
-                .map(String::as_str)
-                .ok_or_else(|| Error::format(format!("the metadata key \"{key}\" is missing, expected a voxcast model")))
+            container.metadata().get(key).map(String::as_str).ok_or_else(|| {
+                Error::format(format!("the metadata key \"{key}\" is missing, expected a voxcast model"))
+            })
         };
         let format = get("format")?;
         if format != FORMAT {

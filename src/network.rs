@@ -190,7 +190,11 @@ impl Network {
             return bad("channels", c.to_string(), "multiples of 8 at levels 1 to 3, one share per attention head");
         }
         if let Some(l) = (0..3).find(|&l| self.key_dims[l] * HEADS != self.channels[l + 1]) {
-            let expected = format!("{} at level {}: a head's output is added to the next one's input, so both have an eighth of the channels", self.channels[l + 1] / HEADS, l + 1);
+            let expected = format!(
+                "{} at level {}: a head's output is added to the next one's input, so both have an eighth of the channels",
+                self.channels[l + 1] / HEADS,
+                l + 1
+            );
             return bad("key_dims", self.key_dims[l].to_string(), &expected);
         }
         for l in 0..2 {

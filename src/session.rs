@@ -2,12 +2,12 @@
 
 use crate::arena::Arena;
 use crate::error::{Error, ErrorKind, Result};
-use crate::exec::{Call, Context, HeadOutput};
 pub use crate::exec::ImageView;
+use crate::exec::{Call, Context, HeadOutput};
 use crate::graph::{Graph, Op, Operation, Scope};
 use crate::model::{Model, PartRef};
-use crate::plan::Plan;
 use crate::network::Network;
+use crate::plan::Plan;
 use crate::rig::{Csr, Level, Rig};
 use crate::scene::Scene;
 use crate::threads::Threads;
@@ -253,16 +253,12 @@ impl Session {
     }
 
     fn context(&self) -> Context<'_> {
-        Context {
-            isa: self.isa,
-            graph: &self.graph,
-            plan: &self.plan,
-            cameras: self.cameras,
-        }
+        Context { isa: self.isa, graph: &self.graph, plan: &self.plan, cameras: self.cameras }
     }
 
     fn frame(&mut self, images: &[ImageView<'_>], observer: &mut dyn FnMut(Event<'_>)) {
-        let (passes, frame) = (0..self.graph.camera_operations, self.graph.camera_operations..self.graph.operations.len());
+        let (passes, frame) =
+            (0..self.graph.camera_operations, self.graph.camera_operations..self.graph.operations.len());
         for (camera, image) in images.iter().enumerate() {
             for index in passes.clone() {
                 self.operation(index, camera, Some(*image), observer);

@@ -101,11 +101,8 @@ pub fn parts(graph: &Graph, operation: &Operation) -> Vec<Part> {
                 Part::plain("2.bias", padded),
             ]
         }
-        Op::Normalise
-        | Op::MaxPool { .. }
-        | Op::UpsampleAdd
-        | Op::Gather { .. }
-        | Op::GlobalMean
-        | Op::Broadcast => vec![],
+        Op::Normalise | Op::MaxPool { .. } | Op::UpsampleAdd | Op::Gather { .. } | Op::GlobalMean | Op::Broadcast => {
+            vec![]
+        }
     }
 }

@@ -48,13 +48,11 @@ fn bottleneck(b: &mut Builder, network: &Network, prefix: &str, x: TensorId, sta
     let width = network.width << stage;
     let out = width * Block::Bottleneck.expansion();
     let (bn1, bn2, bn3) = (format!("{prefix}.bn1"), format!("{prefix}.bn2"), format!("{prefix}.bn3"));
-    let y =
-        b.conv(&format!("{prefix}.conv1"), false, x, ConvShape::image(1, stride, width), After::norm_relu(&bn1));
+    let y = b.conv(&format!("{prefix}.conv1"), false, x, ConvShape::image(1, stride, width), After::norm_relu(&bn1));
     let conv2 = format!("{prefix}.conv2");
     let shape = ConvShape::image(3, 1, width);
     let y = if network.dcn[stage] {
-        let offsets =
-            b.conv(&format!("{conv2}.conv_offset"), true, y, ConvShape::image(3, 1, 27), After::default());
+        let offsets = b.conv(&format!("{conv2}.conv_offset"), true, y, ConvShape::image(3, 1, 27), After::default());
         let geometry = shape.geometry(b.graph.tensor(y));
         let z = b.push(&conv2, Op::DeformConv { geometry }, &[y, offsets], geometry.output, width);
         b.last().recipe = Recipe::Conv(ConvNames { prefix: conv2, bias: false, norm: None });
@@ -69,8 +67,7 @@ fn bottleneck(b: &mut Builder, network: &Network, prefix: &str, x: TensorId, sta
 fn basic(b: &mut Builder, network: &Network, prefix: &str, x: TensorId, stage: usize, stride: usize) -> TensorId {
     let width = network.width << stage;
     let (bn1, bn2) = (format!("{prefix}.bn1"), format!("{prefix}.bn2"));
-    let y =
-        b.conv(&format!("{prefix}.conv1"), false, x, ConvShape::image(3, stride, width), After::norm_relu(&bn1));
+    let y = b.conv(&format!("{prefix}.conv1"), false, x, ConvShape::image(3, stride, width), After::norm_relu(&bn1));
     let shortcut = shortcut(b, prefix, x, width, stride);
     b.conv(&format!("{prefix}.conv2"), false, y, ConvShape::image(3, 1, width), After::norm_relu(&bn2).add(shortcut))
 }

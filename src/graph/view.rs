@@ -75,8 +75,7 @@ fn single_scale(b: &mut Builder, network: &Network, level: usize, features: Tens
     b.stage(format!("{stage}.aspp"));
 
     let fused = b.push(&format!("{prefix}.combine_coeff"), Op::Gate, &[volume, bev], [x, y, z], channels);
-    b.last().recipe =
-        Recipe::Conv(ConvNames { prefix: format!("{prefix}.combine_coeff"), bias: true, norm: None });
+    b.last().recipe = Recipe::Conv(ConvNames { prefix: format!("{prefix}.combine_coeff"), bias: true, norm: None });
     b.stage(format!("{stage}.fused"));
     fused
 }
@@ -107,13 +106,8 @@ fn depthwise(b: &mut Builder, prefix: &str, x: TensorId) -> TensorId {
 fn feed_forward(b: &mut Builder, prefix: &str, x: TensorId) -> TensorId {
     let channels = b.graph.tensor(x).channels;
     let norm = format!("{prefix}.pw1.bn");
-    let hidden = b.conv(
-        &format!("{prefix}.pw1.c"),
-        false,
-        x,
-        ConvShape::plane(1, 1, 2 * channels),
-        After::norm_relu(&norm),
-    );
+    let hidden =
+        b.conv(&format!("{prefix}.pw1.c"), false, x, ConvShape::plane(1, 1, 2 * channels), After::norm_relu(&norm));
     let norm = format!("{prefix}.pw2.bn");
     b.conv(&format!("{prefix}.pw2.c"), false, hidden, ConvShape::plane(1, 1, channels), After::norm(&norm).add(x))
 }
