@@ -17,7 +17,9 @@ use voxcast::{Error, Model, Network, Result, Session};
 #[command(after_help = "\
 Examples:
   voxcast demo -o demo-out
-  voxcast demo -o demo-out --seed 7 --threads 1 --isa scalar    (the same digest as with any other threads and isa)
+  voxcast demo -o demo-out --seed 7
+  voxcast demo -o demo-out --threads 1                 (the same digest as with any other number of threads)
+  voxcast demo -o demo-out --threads 1 --isa scalar    (the same digest again, after some minutes)
 
 The classes mean nothing: nobody trained this network.")]
 pub struct Demo {
@@ -68,7 +70,9 @@ impl Demo {
         let picture = run::draw(model.network(), &scene, &result, "voxcast demo", &subtitle)?;
         picture.write_png(&directory.join("occupancy.png"))?;
         let d = directory.display();
-        println!("see {d}/occupancy.png; the same again: voxcast run --model {d}/model.safetensors {d}/scene -o out.npz");
+        println!(
+            "see {d}/occupancy.png; the same again: voxcast run --model {d}/model.safetensors {d}/scene -o out.npz"
+        );
         Ok(())
     }
 }
