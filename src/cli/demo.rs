@@ -27,7 +27,7 @@ pub struct Demo {
     #[arg(short, long, value_name = "DIR", default_value = "voxcast-demo")]
     output: PathBuf,
     /// Which street is drawn and which weights are used
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 3)]
     seed: u64,
     #[command(flatten)]
     machine: Machine,
