@@ -11,7 +11,7 @@
 //! needs none: its rows lie in memory already.
 
 use crate::isa::Isa;
-use crate::product::{Linear, Product, Source, product};
+use crate::product::{DEPTH, Linear, PIECES, Product, Source, product};
 use crate::simd::{Kernel, Simd, dispatch};
 use std::ops::Range;
 
@@ -71,12 +71,6 @@ impl Geometry {
             "the geometry overflows"
         );
         assert_eq!(Some(input.len()), product(self.input, self.channels), "the input has another shape");
-    }
-
-    /// Whether no window starts behind the input, where there is no padding before it either.
-    #[inline(always)]
-    fn starts_inside(&self) -> bool {
-        (0..3).all(|axis| self.padding[axis] == 0 && (self.output[axis] - 1) * self.stride[axis] < self.input[axis])
     }
 }
 
@@ -152,59 +146,116 @@ impl Conv<'_> {
     }
 }
 
-impl Source for Conv<'_> {
+/// A stretch of k: taps of the last axis, as far as they are contiguous in memory, or more than one such stretch where
+/// they are too short to be worth a pointer each.
+#[derive(Clone, Copy)]
+pub(crate) struct Stretch {
+    /// First tap.
+    tap: [usize; 3],
+    /// Elements of its run that come before the stretch.
+    skip: usize,
+}
+
+impl Conv<'_> {
+    /// Taps that lie side by side in memory.
     #[inline(always)]
-    fn fill<S: Simd>(&self, s: S, row: usize, mut k: usize, mut piece: &mut [f32]) {
+    fn run_taps(&self) -> usize {
+        if self.geometry.dilation[2] == 1 { self.geometry.kernel[2] } else { 1 }
+    }
+
+    /// The `len` elements from `stretch` on within one run: where they start in the input, if all of them are in it,
+    /// else which of them are, and where those start.
+    #[inline(always)]
+    fn locate(&self, at: [usize; 3], stretch: Stretch, len: usize) -> Result<usize, (Range<usize>, usize)> {
         let g = &self.geometry;
-        let [d, h, w] = g.position(row);
-        // A run is what is contiguous in memory: all kw taps, or one tap where dilation pulls them apart.
-        let taps = if g.dilation[2] == 1 { g.kernel[2] } else { 1 };
-        let run = taps * g.channels;
+        let y = (at[0] * g.stride[0] + stretch.tap[0] * g.dilation[0]).wrapping_sub(g.padding[0]);
+        let x = (at[1] * g.stride[1] + stretch.tap[1] * g.dilation[1]).wrapping_sub(g.padding[1]);
+        if y >= g.input[0] || x >= g.input[1] {
+            return Err((0..0, 0));
+        }
         let line = (g.input[2] * g.channels) as isize;
-        while !piece.is_empty() {
-            let (outer, skip) = (k / run, k % run);
-            let len = (run - skip).min(piece.len());
-            let (part, rest) = piece.split_at_mut(len);
-            piece = rest;
-            k += len;
-            let across = g.kernel[2] / taps;
-            let (kd, kh, kw) = (outer / (across * g.kernel[1]), outer / across % g.kernel[1], outer % across);
-            let y = (d * g.stride[0] + kd * g.dilation[0]).wrapping_sub(g.padding[0]);
-            let x = (h * g.stride[1] + kh * g.dilation[1]).wrapping_sub(g.padding[1]);
-            if y >= g.input[0] || x >= g.input[1] {
-                part.fill(0.0);
-                continue;
+        let column = (at[2] * g.stride[2] + stretch.tap[2] * g.dilation[2]) as isize - g.padding[2] as isize;
+        let start = column * g.channels as isize + stretch.skip as isize;
+        let base = (y * g.input[1] + x) * line as usize;
+        if start >= 0 && start + len as isize <= line {
+            return Ok(base + start as usize);
+        }
+        let before = (-start).clamp(0, len as isize);
+        let end = (line - start).clamp(before, len as isize);
+        Err((before as usize..end as usize, base.wrapping_add_signed(start + before)))
+    }
+
+    /// Writes the elements from `stretch` on, over as many runs as it takes.
+    #[inline(always)]
+    fn write<S: Simd>(&self, s: S, at: [usize; 3], mut stretch: Stretch, mut out: &mut [f32]) {
+        let g = &self.geometry;
+        let taps = self.run_taps();
+        while !out.is_empty() {
+            let len = (taps * g.channels - stretch.skip).min(out.len());
+            let (part, rest) = out.split_at_mut(len);
+            out = rest;
+            match self.locate(at, stretch, len) {
+                Ok(start) => copy(s, &self.input[start..start + len], part),
+                Err((inside, start)) => {
+                    part[..inside.start].fill(0.0);
+                    part[inside.end..].fill(0.0);
+                    let len = inside.len();
+                    part[inside].copy_from_slice(&self.input[if len == 0 { 0..0 } else { start..start + len }]);
+                }
             }
-            let column = (w * g.stride[2] + kw * g.dilation[2]) as isize - g.padding[2] as isize;
-            let start = column * g.channels as isize + skip as isize;
-            let base = (y * g.input[1] + x) * line as usize;
-            if start >= 0 && start + len as isize <= line {
-                copy(s, &self.input[base + start as usize..][..len], part);
-                continue;
+            stretch.skip = 0;
+            stretch.tap[2] += taps;
+            if stretch.tap[2] >= g.kernel[2] {
+                stretch.tap = [stretch.tap[0], stretch.tap[1] + 1, 0];
             }
-            let before = (-start).clamp(0, len as isize) as usize;
-            let after = (start + len as isize - line).clamp(0, len as isize) as usize;
-            part.fill(0.0);
-            if before + after < len {
-                let from = base + (start + before as isize) as usize;
-                part[before..len - after].copy_from_slice(&self.input[from..from + len - after - before]);
+            if stretch.tap[1] == g.kernel[1] {
+                stretch.tap = [stretch.tap[0] + 1, 0, 0];
             }
+        }
+    }
+}
+
+impl Source for Conv<'_> {
+    type At = [usize; 3];
+    type Part = Stretch;
+
+    #[inline(always)]
+    fn at(&self, row: usize) -> [usize; 3] {
+        self.geometry.position(row)
+    }
+
+    #[inline(always)]
+    fn next(&self, [d, h, w]: [usize; 3]) -> [usize; 3] {
+        let [_, height, width] = self.geometry.output;
+        match (h + 1 == height, w + 1 == width) {
+            (_, false) => [d, h, w + 1],
+            (false, true) => [d, h + 1, 0],
+            (true, true) => [d + 1, 0, 0],
         }
     }
 
     #[inline(always)]
-    fn stored(&self, row: usize, k: usize, len: usize) -> Option<&[f32]> {
+    fn part(&self, k: usize) -> (Stretch, usize) {
         let g = &self.geometry;
-        if g.kernel != [1; 3] || !g.starts_inside() {
-            return None;
+        let taps = self.run_taps();
+        let run = taps * g.channels;
+        let (index, skip) = (k / run, k % run);
+        let across = g.kernel[2] / taps;
+        let tap = [index / (across * g.kernel[1]), index / across % g.kernel[1], index % across * taps];
+        let most = if run * PIECES < DEPTH { DEPTH } else { run - skip };
+        (Stretch { tap, skip }, most)
+    }
+
+    #[inline(always)]
+    fn piece<'a, S: Simd>(&'a self, s: S, at: [usize; 3], stretch: Stretch, spare: &'a mut [f32]) -> &'a [f32] {
+        let len = spare.len();
+        if stretch.skip + len <= self.run_taps() * self.geometry.channels
+            && let Ok(start) = self.locate(at, stretch, len)
+        {
+            return &self.input[start..start + len];
         }
-        let row = if g.output == g.input && g.stride == [1; 3] {
-            row
-        } else {
-            let [d, h, w] = g.position(row);
-            ((d * g.stride[0]) * g.input[1] + h * g.stride[1]) * g.input[2] + w * g.stride[2]
-        };
-        Some(&self.input[row * g.channels + k..][..len])
+        self.write(s, at, stretch, spare);
+        spare
     }
 }
 

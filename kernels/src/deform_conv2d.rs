@@ -16,7 +16,7 @@
 use crate::conv::Geometry;
 use crate::isa::Isa;
 use crate::math::sigmoid;
-use crate::product::{Linear, Product, Source, product};
+use crate::product::{DEPTH, Linear, Product, Source, product};
 use crate::simd::{Kernel, LANES, Simd, dispatch};
 use std::ops::Range;
 
@@ -74,9 +74,8 @@ impl DeformConv2d<'_> {
 
     /// `None` where the sample is 0.
     #[inline(always)]
-    fn sample(&self, row: usize, tap: usize) -> Option<Sample> {
+    fn sample(&self, (row, [_, h, w]): (usize, [usize; 3]), tap: usize) -> Option<Sample> {
         let g = &self.geometry;
-        let [_, h, w] = g.position(row);
         let [_, height, width] = g.input;
         let taps = self.taps();
         let offsets = &self.offsets[row * 3 * taps..][..3 * taps];
@@ -110,7 +109,9 @@ impl DeformConv2d<'_> {
     /// Element `k` of the virtual left matrix's row `row`.
     fn element(&self, row: usize, k: usize) -> f32 {
         let c = k % self.geometry.channels;
-        let Some(Sample { corners, weights }) = self.sample(row, k / self.geometry.channels) else { return 0.0 };
+        let Some(Sample { corners, weights }) = self.sample(self.at(row), k / self.geometry.channels) else {
+            return 0.0;
+        };
         let mut value = weights[0] * self.input[corners[0] + c];
         for i in 1..4 {
             value = weights[i].mul_add(self.input[corners[i] + c], value);
@@ -120,22 +121,43 @@ impl DeformConv2d<'_> {
 }
 
 impl Source for DeformConv2d<'_> {
+    /// The row and its position in the output.
+    type At = (usize, [usize; 3]);
+    type Part = usize;
+
     #[inline(always)]
-    fn fill<S: Simd>(&self, s: S, row: usize, mut k: usize, mut piece: &mut [f32]) {
+    fn at(&self, row: usize) -> Self::At {
+        (row, self.geometry.position(row))
+    }
+
+    #[inline(always)]
+    fn next(&self, (row, [_, h, w]): Self::At) -> Self::At {
+        (row + 1, if w + 1 == self.geometry.output[2] { [0, h + 1, 0] } else { [0, h, w + 1] })
+    }
+
+    #[inline(always)]
+    fn part(&self, k: usize) -> (usize, usize) {
+        (k, DEPTH)
+    }
+
+    #[inline(always)]
+    fn piece<'a, S: Simd>(&'a self, s: S, at: Self::At, mut k: usize, spare: &'a mut [f32]) -> &'a [f32] {
         let channels = self.geometry.channels;
+        let mut piece = &mut *spare;
         while !piece.is_empty() {
             let (tap, c) = (k / channels, k % channels);
             let len = (channels - c).min(piece.len());
             let (part, rest) = piece.split_at_mut(len);
             piece = rest;
             k += len;
-            match self.sample(row, tap) {
+            match self.sample(at, tap) {
                 None => part.fill(0.0),
                 Some(Sample { corners, weights }) => {
                     blend(s, corners.map(|at| &self.input[at + c..][..len]), weights, part);
                 }
             }
         }
+        spare
     }
 }
 
@@ -143,12 +165,22 @@ impl Source for DeformConv2d<'_> {
 #[inline(always)]
 fn blend<S: Simd>(s: S, corners: [&[f32]; 4], weights: [f32; 4], out: &mut [f32]) {
     let weights = weights.map(|w| s.splat(w));
-    for (i, out) in out.chunks_mut(LANES).enumerate() {
-        let [a, b, c, d] = corners.map(|x| s.load_part(&x[i * LANES..][..out.len()]));
-        let value = s.mul_add(weights[1], b, s.mul(weights[0], a));
-        let value = s.mul_add(weights[3], d, s.mul_add(weights[2], c, value));
-        s.store_part(out, value);
+    let (chunks, tail) = out.as_chunks_mut::<LANES>();
+    let whole = chunks.len();
+    let wide = corners.map(|x| x.as_chunks::<LANES>().0);
+    for (i, out) in chunks.iter_mut().enumerate() {
+        s.store(out, mix(s, wide.map(|x| s.load(&x[i])), weights));
     }
+    if !tail.is_empty() {
+        let corners = corners.map(|x| s.load_part(&x[whole * LANES..][..tail.len()]));
+        s.store_part(tail, mix(s, corners, weights));
+    }
+}
+
+#[inline(always)]
+fn mix<S: Simd>(s: S, [a, b, c, d]: [S::V; 4], weights: [S::V; 4]) -> S::V {
+    let value = s.mul_add(weights[1], b, s.mul(weights[0], a));
+    s.mul_add(weights[3], d, s.mul_add(weights[2], c, value))
 }
 
 struct Run<'a> {

@@ -82,13 +82,24 @@ struct Rows<'a> {
 }
 
 impl Source for Rows<'_> {
+    type At = usize;
+    type Part = usize;
+
     #[inline(always)]
-    fn fill<S: Simd>(&self, _: S, row: usize, k: usize, piece: &mut [f32]) {
-        piece.copy_from_slice(&self.data[row * self.stride + k..][..piece.len()]);
+    fn at(&self, row: usize) -> usize {
+        row
     }
     #[inline(always)]
-    fn stored(&self, row: usize, k: usize, len: usize) -> Option<&[f32]> {
-        Some(&self.data[row * self.stride + k..][..len])
+    fn next(&self, row: usize) -> usize {
+        row + 1
+    }
+    #[inline(always)]
+    fn part(&self, k: usize) -> (usize, usize) {
+        (k, self.stride - k)
+    }
+    #[inline(always)]
+    fn piece<'a, S: Simd>(&'a self, _: S, row: usize, k: usize, spare: &'a mut [f32]) -> &'a [f32] {
+        &self.data[row * self.stride + k..][..spare.len()]
     }
 }
 

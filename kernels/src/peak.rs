@@ -1,10 +1,15 @@
 //! The machine's own ceiling: fused multiply-adds that never leave the registers.
 
 use crate::isa::Isa;
-use crate::simd::{Kernel, LANES, Simd, dispatch};
+use crate::simd::{Kernel, LANES, Simd, dispatch, tree_sum};
 
 /// Independent chains: enough to cover the latency of every vector unit, few enough to stay in registers.
 const CHAINS: usize = 6;
+
+/// Where lane `i` of chain `c` starts. All differ, or the compiler would compute equal registers once.
+fn start(c: usize) -> [f32; LANES] {
+    std::array::from_fn(|i| 0.25 + 0.01 * (c * LANES + i) as f32)
+}
 
 /// Runs `rounds` rounds of register-only multiply-adds and returns how many it did. The caller takes the time; what is
 /// returned beside the count only keeps the work from being optimised away.
@@ -18,7 +23,7 @@ impl Kernel for Rounds {
     type Output = (u64, f32);
 
     fn reference(self) -> (u64, f32) {
-        let mut sums = [0.5f32; CHAINS];
+        let mut sums: [f32; CHAINS] = std::array::from_fn(|c| start(c)[0]);
         for _ in 0..self.0 {
             sums.iter_mut().for_each(|s| *s = s.mul_add(0.999, 0.001));
         }
@@ -28,14 +33,14 @@ impl Kernel for Rounds {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> (u64, f32) {
         let (scale, shift) = (s.splat(0.999), s.splat(0.001));
-        let mut sums = [s.splat(0.5); CHAINS];
+        let mut sums: [S::V; CHAINS] = std::array::from_fn(|c| s.load(&start(c)));
         for _ in 0..self.0 {
             for sum in &mut sums {
                 *sum = s.mul_add(*sum, scale, shift);
             }
         }
         let total = sums.iter().fold(s.splat(0.0), |a, b| s.add(a, *b));
-        ((self.0 * CHAINS * LANES) as u64, s.lanes(total)[0])
+        ((self.0 * CHAINS * LANES) as u64, tree_sum(s.lanes(total)) / LANES as f32)
     }
 }
 

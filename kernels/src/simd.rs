@@ -55,6 +55,9 @@ pub(crate) trait Simd: Copy {
     /// 2 to the power `n`, for integral lanes from -126 to 127.
     fn exp2_int(self, n: Self::V) -> Self::V;
 
+    /// Names the cache line of `p` to the first-level cache. Any address will do; nothing is read.
+    fn prefetch(self, p: *const f32);
+
     /// Reads 16 lanes.
     #[inline(always)]
     fn load(self, x: &[f32; LANES]) -> Self::V {

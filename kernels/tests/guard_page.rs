@@ -181,8 +181,10 @@ fn conv_3d() {
 fn deform() {
     let geometry = walk([1, 5, 7], 19, [1, 3, 3], 1, [0, 1, 1]);
     let (rows, depth, columns) = (geometry.rows(), geometry.depth(), 17);
-    // Positions from far outside to the last row and column, whole ones among them.
-    let offsets: Vec<f32> = (0..rows * 27).map(|i| ((i * 29 % 61) as f32 - 30.0) * 0.25).collect();
+    // Positions from far outside on; the first and the last output sample where they are, up to both ends of the image.
+    let mut offsets: Vec<f32> = (0..rows * 27).map(|i| ((i * 29 % 61) as f32 - 30.0) * 0.25).collect();
+    offsets[..18].fill(0.0);
+    offsets[(rows - 1) * 27..][..18].fill(0.0);
     everywhere(|isa, side| {
         let input = Guarded::new(side, &numbers(5 * 7 * 19));
         let offsets = Guarded::new(side, &offsets);

@@ -43,11 +43,26 @@ impl Kernel for Multiply<'_> {
 }
 
 impl Source for Case {
-    fn fill<S: Simd>(&self, _: S, row: usize, k: usize, piece: &mut [f32]) {
-        piece.copy_from_slice(&self.left[row * self.owned.depth + k..][..piece.len()]);
+    type At = usize;
+    type Part = usize;
+
+    fn at(&self, row: usize) -> usize {
+        row
     }
-    fn stored(&self, row: usize, k: usize, len: usize) -> Option<&[f32]> {
-        self.stored.then(|| &self.left[row * self.owned.depth + k..][..len])
+    fn next(&self, row: usize) -> usize {
+        row + 1
+    }
+    fn part(&self, k: usize) -> (usize, usize) {
+        // Pieces of odd lengths, so that blocks end inside them and hold one or many.
+        (k, if self.stored { DEPTH } else { 70 - k % 70 })
+    }
+    fn piece<'a, S: Simd>(&'a self, _: S, row: usize, k: usize, spare: &'a mut [f32]) -> &'a [f32] {
+        let here = &self.left[row * self.owned.depth + k..][..spare.len()];
+        if self.stored || (row + k) % 3 == 0 {
+            return here;
+        }
+        spare.copy_from_slice(here);
+        spare
     }
 }
 
