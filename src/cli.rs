@@ -63,24 +63,37 @@ impl Arguments {
     }
 }
 
-/// How to compute. None of it changes a result.
+/// On how many threads to compute. It does not change a result.
 #[derive(Args, Debug)]
-pub struct Machine {
+pub struct ThreadCount {
     /// Threads that compute [default: one per CPU]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
-    /// Instruction set: scalar, avx2 [default: the fastest of this CPU]
-    #[arg(long, value_name = "NAME")]
-    isa: Option<String>,
 }
 
-impl Machine {
+impl ThreadCount {
     pub fn threads(&self) -> Result<Threads> {
         let count = match self.threads {
             Some(count) => usize::from(count),
             None => std::thread::available_parallelism().map_or(1, usize::from),
         };
         Threads::new(count)
+    }
+}
+
+/// How to run a network. None of it changes a result.
+#[derive(Args, Debug)]
+pub struct Machine {
+    #[command(flatten)]
+    threads: ThreadCount,
+    /// Instruction set: scalar (the specification, and slow), avx2 [default: the fastest of this CPU]
+    #[arg(long, value_name = "NAME")]
+    isa: Option<String>,
+}
+
+impl Machine {
+    pub fn threads(&self) -> Result<Threads> {
+        self.threads.threads()
     }
 
     pub fn isa(&self) -> Result<Isa> {

@@ -1,4 +1,105 @@
-//! voxcast turns a ring of camera images into a semantic voxel grid on a plain CPU.
+//! voxcast turns a ring of camera images into a semantic voxel grid on a plain CPU, with the same bits every time.
+//!
+//! It runs networks of the InverseMatrixVT3D family (arXiv 2401.12422): a ResNet with a feature pyramid for each camera,
+//! two static sparse matrices per level that carry pixel features into voxels and a bird's-eye view, and a 3-D
+//! convolutional decoder from coarse to fine.
+//!
+//! # The pipeline
+//!
+//! ```text
+//! checkpoint, network ── import ──▶ model ──┐
+//! calibration ────────── RigBuilder ▶ rig ──┼──▶ Session ── run ──▶ Occupancy
+//! images ───────────────────────────────────┘
+//! ```
+//!
+//! A *network* ([`Network`]) is the architecture as numbers. A *model* ([`Model`]) is a network with weights, folded and
+//! packed as the kernels read them. A *rig* ([`Rig`]) holds the six projection matrices of one set of cameras. A
+//! *session* ([`Session`]) owns the memory in which frames run.
+//!
+//! ```no_run
+//! use std::path::Path;
+//! use std::sync::Arc;
+//! use voxcast::rig::RigBuilder;
+//! use voxcast::{ImageView, Model, Session, SessionOptions, Threads};
+//!
+//! # fn main() -> voxcast::Result<()> {
+//! # let calibrations: Vec<[f32; 16]> = vec![];
+//! # let cameras: Vec<Vec<u8>> = vec![];
+//! // Once. A rig of fixed cameras can be saved and mapped instead: `Rig::save`, `Rig::open`.
+//! let model = Arc::new(Model::open(Path::new("model.safetensors"))?);
+//! let mut builder = RigBuilder::new(model.network(), calibrations.len())?;
+//! let rig = Arc::new(builder.build(&calibrations)?);
+//! let options = SessionOptions { threads: Threads::new(2)?, logits: true, ..SessionOptions::default() };
+//! println!("{} bytes", Session::memory(&model, rig.cameras(), &options)?.total());
+//! let mut session = Session::new(model, rig, &options)?;
+//!
+//! // Every frame. If the calibration moves, build another rig and pass it to `Session::set_rig`.
+//! let images: Vec<ImageView> =
+//!     cameras.iter().map(|bgr| ImageView { height: 900, width: 1600, bgr }).collect();
+//! let occupancy = session.run(&images)?;
+//! let [_, y, z] = occupancy.grid;
+//! let class = occupancy.classes[(10 * y + 20) * z + 3]; // voxel (10, 20, 3); 0 is empty
+//! # let _ = class;
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! A checkpoint becomes a model by [`import::import`], or by `voxcast import` on the command line.
+#![cfg_attr(
+    feature = "import",
+    doc = r#"
+```no_run
+# fn main() -> voxcast::Result<()> {
+use std::path::Path;
+use voxcast::{Network, checkpoint::Checkpoint, import::import, model::Options};
+
+let network = Network::built_in("nuscenes-200").expect("a built-in name");
+let checkpoint = Checkpoint::open("epoch_24.pth")?;
+import(&checkpoint, &network, Options::default(), Path::new("model.safetensors"), &mut |_, _| ())?;
+# Ok(())
+# }
+```
+"#
+)]
+//!
+//! # Shapes and layouts
+//!
+//! - Images are 8-bit **BGR**, rows top to bottom, `height * width * 3` bytes. Height and width, rounded up to multiples of
+//!   32, must be [`Network::image`]; the padding below and to the right is zero after normalisation.
+//! - A calibration is a row-major 4x4 matrix per camera, lidar-frame metres (x, y, z, 1) to (u d, v d, d, 1), with u and v
+//!   in pixels of the unpadded image. Cameras come in the order of the training.
+//! - Grids are [X, Y, Z] in the lidar frame, z fastest: voxel (x, y, z) is at `(x * Y + y) * Z + z`. [`Network::bounds`]
+//!   are its metres.
+//! - Inside, every tensor is channels last and f32. Weights are f32 or f16.
+//!
+//! # Memory and threads
+//!
+//! [`Session::new`] takes the arena and the output from the system, [`Session::memory`] says beforehand how much, and
+//! frames reuse them. Weights and matrices are used where they are mapped. A session computes on the calling thread, on a
+//! pool of its own, or on one that it is given ([`Threads`]).
+//!
+//! # Determinism
+//!
+//! The same model, rig and images give the same bits for every number of threads, every instruction set ([`Isa`]) and
+//! every run. `docs/determinism.md` has the order of every sum. Another graph ([`SessionOptions::unfolded`]) or another
+//! precision is another computation and gives other bits. The floating-point environment must be the default one.
+//!
+//! # Errors
+//!
+//! Bytes from outside give an [`Error`] with a kind, the file where there is one, and a line that says what was found and
+//! what was expected. They cause no panic and no allocation that their size does not justify. Functions that can panic say
+//! so under "Panics". The library never prints, never reads the environment and never exits.
+//!
+//! # Features
+//!
+//! | feature | gives |
+//! |---|---|
+//! | `cli` (default) | the program `voxcast`, and the other three |
+//! | `import` | `checkpoint`: reading `.pth` and `.safetensors` |
+//! | `images` | `picture`, and JPEG and PNG in [`Scene::open`] and `Scene::save` |
+//! | `npz` | `npz`: NumPy's `.npz`, written and read |
+//!
+//! Without features the library reads models, rigs and `.safetensors` scenes, and runs them.
 
 mod arena;
 pub mod camera;
@@ -35,3 +136,8 @@ pub use scene::Scene;
 pub use session::{ImageView, Occupancy, Session, SessionOptions};
 pub use threads::Threads;
 pub use voxcast_kernels::{Isa, IsaError};
+
+/// The program in the README, compiled.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+pub struct Readme;

@@ -14,7 +14,7 @@ pub const BGR_MEAN: [f32; 3] = [103.530, 116.280, 123.675];
 /// If `image` is not `height * width * 3` bytes, or `out` is not whole rows.
 pub fn normalise(image: &[u8], height: usize, width: usize, padded_width: usize, first_row: usize, out: &mut [f32]) {
     assert_eq!(image.len(), height * width * 3, "the image has another size");
-    assert!(padded_width >= width && out.len() % (padded_width * 3) == 0, "the output is not whole rows");
+    assert!(padded_width >= width && out.len().is_multiple_of(padded_width * 3), "the output is not whole rows");
     for (i, row) in out.chunks_exact_mut(padded_width * 3).enumerate() {
         let (pixels, padding) = row.split_at_mut(if first_row + i < height { width * 3 } else { 0 });
         padding.fill(0.0);

@@ -17,7 +17,9 @@ use voxcast::{Error, Model, Network, Result, Session};
 #[command(after_help = "\
 Examples:
   voxcast demo -o demo-out
-  voxcast demo -o demo-out --seed 7 --threads 1 --isa scalar    (the same digest as with any other threads and isa)
+  voxcast demo -o demo-out --seed 7
+  voxcast demo -o demo-out --threads 1                 (the same digest as with any other number of threads)
+  voxcast demo -o demo-out --threads 1 --isa scalar    (the same digest again, after some minutes)
 
 The classes mean nothing: nobody trained this network.")]
 pub struct Demo {
@@ -25,7 +27,7 @@ pub struct Demo {
     #[arg(short, long, value_name = "DIR", default_value = "voxcast-demo")]
     output: PathBuf,
     /// Which street is drawn and which weights are used
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 3)]
     seed: u64,
     #[command(flatten)]
     machine: Machine,

@@ -26,10 +26,10 @@ pub struct Import {
     /// nuscenes-200, nuscenes-256, semantickitti-256, or a network.json
     #[arg(long, value_name = "NAME|FILE.json")]
     network: String,
-    /// How weights are stored: f32 or f16
+    /// How weights are stored; arithmetic is f32 either way
     #[arg(long, default_value = "f32", value_parser = ["f32", "f16"])]
     precision: String,
-    /// Rewrites applied to the network: all, batch-norm (keep the pyramid's features), none
+    /// Rewrites applied to the network: all, batch-norm (keeps the pyramid's features), none (keeps batch norms too)
     #[arg(long, default_value = "all", value_parser = ["all", "batch-norm", "none"])]
     fold: String,
     /// The model to write

@@ -1,10 +1,10 @@
 //! `voxcast inspect`
 
-use super::{Machine, frame, terminal};
+use super::{ThreadCount, terminal};
 use clap::Args;
 use std::path::PathBuf;
 use voxcast::container::Container;
-use voxcast::{Error, Model, Network, Result, Rig, Session};
+use voxcast::{Error, Model, Network, Result, Rig, Session, SessionOptions};
 
 /// Say what is in a model or a rig: shapes, precisions, sizes, the memory a session takes, checksum.
 #[derive(Args, Debug)]
@@ -16,23 +16,23 @@ Examples:
 pub struct Inspect {
     /// A model or a rig
     file: PathBuf,
-    /// Cameras that the session is sized for [default: as the network says]
+    /// Cameras that a model's session is sized for [default: as the network says]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=64))]
     cameras: Option<u16>,
-    /// Also print every operation
+    /// Also print every operation of a model
     #[arg(long)]
     operations: bool,
-    /// Also print where every tensor lies in the arena
+    /// Also print where every tensor of a model lies in the arena
     #[arg(long)]
     plan: bool,
-    /// Also print every stored tensor
+    /// Also print every stored tensor of a model
     #[arg(long)]
     tensors: bool,
     /// Print as JSON
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    machine: Machine,
+    threads: ThreadCount,
 }
 
 impl Inspect {
@@ -46,7 +46,7 @@ impl Inspect {
     fn model(&self) -> Result<()> {
         let model = Model::open(&self.file)?;
         let network = model.network();
-        let options = frame::options(&self.machine)?;
+        let options = SessionOptions { threads: self.threads.threads()?, ..SessionOptions::default() };
         let cameras = self.cameras.map_or(network.cameras, usize::from);
         let graph = model.graph(false, false);
         let memory = Session::memory(&model, cameras, &options)?;

@@ -21,13 +21,13 @@ pub struct Profile {
     /// The model
     #[arg(long)]
     model: PathBuf,
-    /// The scene's matrices, made by `voxcast rig`
+    /// The scene's matrices: made by `voxcast rig`, or plain CSR of another program
     #[arg(long)]
     rig: Option<PathBuf>,
     /// A scene directory or .safetensors
     scene: PathBuf,
     /// Frames to time, after one that is not
-    #[arg(long, default_value_t = 3, value_parser = clap::value_parser!(u16).range(1..=1000))]
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u16).range(1..=1000))]
     repeat: u16,
     /// Rows of the table: every operation, or sums over part of the network or kind of operation
     #[arg(long, default_value = "operation", value_parser = ["operation", "part", "kind"])]

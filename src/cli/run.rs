@@ -21,12 +21,13 @@ Examples:
   voxcast run --model model.safetensors scene/ -o out.npz --dump stages/ --stages level1.volume,logits.lvl0
 
 In Python: numpy.load('out.npz')['classes'] is u8 [X, Y, Z].
-Without --rig the matrices are built from the scene's calibration, as part of the frame.")]
+Without --rig the matrices are built from the scene's calibration before the frame.
+The digest is the XXH3-64 of the classes; it is the same on any number of threads and any instruction set.")]
 pub struct Run {
     /// The model
     #[arg(long)]
     model: PathBuf,
-    /// The scene's matrices, made by `voxcast rig`
+    /// The scene's matrices: made by `voxcast rig`, or plain CSR of another program
     #[arg(long)]
     rig: Option<PathBuf>,
     /// A scene directory or .safetensors
@@ -43,10 +44,11 @@ pub struct Run {
     /// Write stages of the network to DIR/stages.safetensors, channels first
     #[arg(long, value_name = "DIR")]
     dump: Option<PathBuf>,
-    /// Which stages to dump, separated by commas [default: all, which runs without the projection fold]
+    /// Stages or operations to dump, separated by commas; for those that the projection fold removes, the network runs
+    /// without it [default: every stage]
     #[arg(long, value_name = "NAMES", requires = "dump")]
     stages: Option<String>,
-    /// Run without the projection fold
+    /// Run without the projection fold, which rounds differently
     #[arg(long)]
     unfolded: bool,
     /// Print the summary as JSON
@@ -129,7 +131,7 @@ pub fn draw(
 ) -> Result<picture::Picture> {
     let palette = Palette::of(network.classes);
     let occupancy =
-        picture::Occupancy::new("occupancy", result.classes, result.grid, network.bounds, forward_of(&network.bounds))?;
+        picture::Occupancy::new("", result.classes, result.grid, network.bounds, forward_of(&network.bounds))?;
     let images: Vec<_> = scene.names.iter().map(String::as_str).zip(&scene.images).collect();
     Ok(picture::draw(&Figure { title, subtitle, images: &images, occupancies: &[occupancy], palette: &palette }))
 }
