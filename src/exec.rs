@@ -32,6 +32,13 @@ const GATHER_ROWS: usize = 500;
 /// Voxels that one worker classifies at a time.
 const HEAD_ROWS: usize = 960;
 
+/// Computes rows, `stride` apart, with scratch.
+type RowsKernel<'a> = dyn Fn(Range<usize>, usize, &mut [f32], &mut [f32]) + Sync + 'a;
+/// Computes dense lines, with scratch.
+type LinesKernel<'a> = dyn Fn(Range<usize>, &mut [f32], &mut [f32]) + Sync + 'a;
+/// Computes the piece of an index, with scratch.
+type PieceKernel<'a> = dyn Fn(usize, &mut [f32], &mut [f32]) + Sync + 'a;
+
 /// Where a head's result goes.
 pub(crate) struct HeadOutput<'a> {
     pub(crate) classes: &'a mut [u8],
@@ -362,14 +369,7 @@ impl Context<'_> {
     }
 
     /// Cuts a convolution's rows into tiles. The output may be some channels of a wider tensor.
-    fn rows(
-        &self,
-        view: View<'_>,
-        operation: &Operation,
-        geometry: &Geometry,
-        camera: usize,
-        kernel: &(dyn Fn(Range<usize>, usize, &mut [f32], &mut [f32]) + Sync),
-    ) {
+    fn rows(&self, view: View<'_>, operation: &Operation, geometry: &Geometry, camera: usize, kernel: &RowsKernel<'_>) {
         let stride = self.graph.tensor(operation.output).channels;
         let start = self.range(operation.output, camera).start + operation.first_channel;
         let rows = geometry.rows();
@@ -387,14 +387,7 @@ impl Context<'_> {
     }
 
     /// Gives each worker a few of `lines` equal lines of the output: image rows or volume planes.
-    fn lines(
-        &self,
-        view: View<'_>,
-        operation: &Operation,
-        camera: usize,
-        lines: usize,
-        kernel: &(dyn Fn(Range<usize>, &mut [f32], &mut [f32]) + Sync),
-    ) {
+    fn lines(&self, view: View<'_>, operation: &Operation, camera: usize, lines: usize, kernel: &LinesKernel<'_>) {
         let line = self.range(operation.output, camera).len() / lines;
         let per_tile = lines.div_ceil(8 * self.plan.workers()).max(1);
         self.pieces(view, operation, camera, per_tile * line, &|tile, out, scratch| {
@@ -404,14 +397,7 @@ impl Context<'_> {
     }
 
     /// Gives each worker up to `rows` positions of the output at a time.
-    fn chunks(
-        &self,
-        view: View<'_>,
-        operation: &Operation,
-        camera: usize,
-        rows: usize,
-        kernel: &(dyn Fn(Range<usize>, &mut [f32], &mut [f32]) + Sync),
-    ) {
+    fn chunks(&self, view: View<'_>, operation: &Operation, camera: usize, rows: usize, kernel: &LinesKernel<'_>) {
         self.pieces(view, operation, camera, rows * operation.channels, &|tile, out, scratch| {
             let first = tile * rows;
             kernel(first..first + out.len() / operation.channels, out, scratch);
@@ -419,14 +405,7 @@ impl Context<'_> {
     }
 
     /// Cuts the output into pieces of `len` numbers.
-    fn pieces(
-        &self,
-        view: View<'_>,
-        operation: &Operation,
-        camera: usize,
-        len: usize,
-        kernel: &(dyn Fn(usize, &mut [f32], &mut [f32]) + Sync),
-    ) {
+    fn pieces(&self, view: View<'_>, operation: &Operation, camera: usize, len: usize, kernel: &PieceKernel<'_>) {
         let Range { start, end } = self.range(operation.output, camera);
         for_each_tile(self.plan.workers(), (end - start).div_ceil(len), &|worker, tile| {
             let place = start + tile * len..end.min(start + (tile + 1) * len);

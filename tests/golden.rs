@@ -15,7 +15,7 @@ use voxcast::model::Options;
 use voxcast::rig::RigBuilder;
 use voxcast::session::views;
 use voxcast::weights::Precision;
-use voxcast::{Model, Network, Rig, Scene, Session, SessionOptions, Threads};
+use voxcast::{Isa, Model, Network, Rig, Scene, Session, SessionOptions, Threads};
 
 fn golden() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/golden")
@@ -269,7 +269,10 @@ fn half_precision_agrees() {
 #[test]
 fn matrices_are_exactly_those_expected() {
     for case in cases() {
-        let built = RigBuilder::new(&case.network, case.scene.cameras()).unwrap().build(&case.scene.lidar2img).unwrap();
+        let built = RigBuilder::new(&case.network, case.scene.cameras(), Isa::best())
+            .unwrap()
+            .build(&case.scene.lidar2img)
+            .unwrap();
         let entries: usize = (0..3).map(|l| built.level(l).volume.col.len()).sum();
         assert!(entries > 500, "{}: {entries} entries show little", case.name);
         assert!(built == *case.rig, "{}: built {built:?}, expected {:?}", case.name, case.rig);

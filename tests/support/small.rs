@@ -9,7 +9,7 @@ use voxcast::random::Random;
 use voxcast::rig::RigBuilder;
 use voxcast::seeded::SeededWeights;
 use voxcast::weights::Precision;
-use voxcast::{ImageView, Model, Network, Result, Rig};
+use voxcast::{ImageView, Isa, Model, Network, Result, Rig};
 
 /// A network with odd sizes wherever sizes are free: channels that fill no vector, X != Y, windows that need padding.
 pub(crate) fn network() -> Network {
@@ -70,14 +70,15 @@ pub(crate) fn lidar2img(network: &Network, turn: f32) -> Vec<[f32; 16]> {
             let (s, c) = (std::f32::consts::TAU * i as f32 / network.cameras as f32 + turn).sin_cos();
             let (right, down, ahead) = ([s, -c, 0.0, 0.1], [0.0, 0.0, -1.0, 0.3], [c, s, 0.0, -0.5]);
             let row = |a: [f32; 4], f: f32, centre: f32| std::array::from_fn(|k| f * a[k] + centre * ahead[k]);
-            let rows: [[f32; 4]; 4] = [row(right, focal, centre_u), row(down, focal, centre_v), ahead, [0., 0., 0., 1.]];
+            let rows: [[f32; 4]; 4] =
+                [row(right, focal, centre_u), row(down, focal, centre_v), ahead, [0., 0., 0., 1.]];
             rows.concat().try_into().unwrap()
         })
         .collect()
 }
 
 pub(crate) fn rig(network: &Network, turn: f32) -> Arc<Rig> {
-    let mut builder = RigBuilder::new(network, network.cameras).unwrap();
+    let mut builder = RigBuilder::new(network, network.cameras, Isa::best()).unwrap();
     Arc::new(builder.build(&lidar2img(network, turn)).unwrap())
 }
 
