@@ -5,7 +5,7 @@ use crate::error::{Error, ErrorKind, Result};
 use crate::graph::{Graph, Matrix, Op, Operation, Scope, TensorId};
 use crate::plan::Plan;
 use crate::rig::{Csr, Level};
-use crate::threads::for_each_tile;
+use crate::threads::Threads;
 use std::ops::Range;
 use voxcast_kernels::conv::{Conv, Geometry, conv};
 use voxcast_kernels::deconv3d::{Deconv3d, deconv3d};
@@ -42,6 +42,7 @@ pub(crate) struct Context<'a> {
     pub(crate) graph: &'a Graph,
     pub(crate) plan: &'a Plan,
     pub(crate) cameras: usize,
+    pub(crate) threads: &'a Threads,
 }
 
 /// One camera's image as the caller holds it: `height * width * 3` bytes, blue first.
@@ -318,7 +319,7 @@ impl Context<'_> {
         let rows = classes.len();
         let classes = Shared::new(classes);
         let logits = logits.map(Shared::new);
-        for_each_tile(self.plan.workers(), rows.div_ceil(HEAD_ROWS), &|worker, tile| {
+        self.threads.for_each_tile(self.plan.workers(), rows.div_ceil(HEAD_ROWS), &|worker, tile| {
             let rows = tile * HEAD_ROWS..rows.min((tile + 1) * HEAD_ROWS);
             // SAFETY: each tile has its own rows, and each worker its own scratch.
             let (classes, logits, scratch) = unsafe {
@@ -370,7 +371,7 @@ impl Context<'_> {
         let stride = self.graph.tensor(operation.output).channels;
         let start = self.range(operation.output, camera).start + operation.first_channel;
         let rows = geometry.rows();
-        for_each_tile(self.plan.workers(), rows.div_ceil(CONV_ROWS), &|worker, tile| {
+        self.threads.for_each_tile(self.plan.workers(), rows.div_ceil(CONV_ROWS), &|worker, tile| {
             let rows = tile * CONV_ROWS..rows.min((tile + 1) * CONV_ROWS);
             let place = start + rows.start * stride..start + (rows.end - 1) * stride + operation.channels;
             // SAFETY: each tile has its own rows, and each worker its own scratch; `check` found both apart from
@@ -422,7 +423,7 @@ impl Context<'_> {
         kernel: &(dyn Fn(usize, &mut [f32], &mut [f32]) + Sync),
     ) {
         let Range { start, end } = self.range(operation.output, camera);
-        for_each_tile(self.plan.workers(), (end - start).div_ceil(len), &|worker, tile| {
+        self.threads.for_each_tile(self.plan.workers(), (end - start).div_ceil(len), &|worker, tile| {
             let place = start + tile * len..end.min(start + (tile + 1) * len);
             // SAFETY: each tile has its own piece, and each worker its own scratch; `check` found both apart from
             // everything that is read.
