@@ -5,7 +5,7 @@ use crate::error::{Error, ErrorKind, Result};
 use crate::graph::{Graph, Matrix, Op, Operation, Scope, TensorId};
 use crate::plan::Plan;
 use crate::rig::{Csr, Level};
-use crate::threads::for_each_tile;
+use crate::threads::Threads;
 use std::ops::Range;
 use voxcast_kernels::conv::{Conv, Geometry, conv};
 use voxcast_kernels::deconv3d::{Deconv3d, deconv3d};
@@ -51,6 +51,7 @@ pub(crate) struct Context<'a> {
     pub(crate) graph: &'a Graph,
     pub(crate) plan: &'a Plan,
     pub(crate) cameras: usize,
+    pub(crate) threads: &'a Threads,
 }
 
 /// One camera's image as the caller holds it: `height * width * 3` bytes, blue first.
@@ -328,7 +329,7 @@ impl Context<'_> {
         let rows = classes.len();
         let classes = Shared::new(classes);
         let logits = logits.map(Shared::new);
-        for_each_tile(self.plan.workers(), rows.div_ceil(HEAD_ROWS), &|worker, tile| {
+        self.threads.for_each_tile(self.plan.workers(), rows.div_ceil(HEAD_ROWS), &|worker, tile| {
             let rows = tile * HEAD_ROWS..rows.min((tile + 1) * HEAD_ROWS);
             // SAFETY: each tile has its own rows, and each worker its own scratch.
             let (classes, logits, scratch) = unsafe {
@@ -376,7 +377,7 @@ impl Context<'_> {
         // As many tiles as blocks of rows, but the same number for every worker.
         let tiles = rows.div_ceil(CONV_ROWS).next_multiple_of(self.plan.workers());
         let per_tile = rows.div_ceil(tiles).next_multiple_of(CONV_TILE);
-        for_each_tile(self.plan.workers(), rows.div_ceil(per_tile), &|worker, tile| {
+        self.threads.for_each_tile(self.plan.workers(), rows.div_ceil(per_tile), &|worker, tile| {
             let rows = tile * per_tile..rows.min((tile + 1) * per_tile);
             let place = start + rows.start * stride..start + (rows.end - 1) * stride + operation.channels;
             // SAFETY: each tile has its own rows, and each worker its own scratch; `check` found both apart from
@@ -407,7 +408,7 @@ impl Context<'_> {
     /// Cuts the output into pieces of `len` numbers.
     fn pieces(&self, view: View<'_>, operation: &Operation, camera: usize, len: usize, kernel: &PieceKernel<'_>) {
         let Range { start, end } = self.range(operation.output, camera);
-        for_each_tile(self.plan.workers(), (end - start).div_ceil(len), &|worker, tile| {
+        self.threads.for_each_tile(self.plan.workers(), (end - start).div_ceil(len), &|worker, tile| {
             let place = start + tile * len..end.min(start + (tile + 1) * len);
             // SAFETY: each tile has its own piece, and each worker its own scratch; `check` found both apart from
             // everything that is read.
