@@ -284,27 +284,29 @@ impl Graph {
     }
 
     /// Multiply-adds of `operation`, of one camera where it runs per camera. Operations that only move or add numbers
-    /// count 0, and a gather counts none because its cost is memory.
+    /// count 0, and a gather counts none because its cost is memory. [`u64::MAX`] stands for more than that.
     pub fn multiply_adds(&self, operation: &Operation) -> u64 {
         let out = self.tensor(operation.output);
         let x = operation.inputs.first().map(|&id| self.tensor(id));
         let x_channels = x.map_or(0, |x| x.channels);
-        let rows = out.rows();
+        // Up to 32 bits of rows, and several factors of up to 21.
+        let wide = |v: usize| v as u128;
+        let (rows, channels) = (wide(out.rows()), wide(operation.channels));
         let count = match operation.op {
-            Op::Conv { geometry } | Op::DeformConv { geometry } => rows * geometry.depth() * operation.channels,
-            Op::Depthwise { side } => rows * side * side * operation.channels,
-            Op::Deconv => rows * 8 * x_channels * operation.channels,
-            Op::BatchNorm | Op::Gate => rows * operation.channels,
+            Op::Conv { geometry } | Op::DeformConv { geometry } => rows * wide(geometry.depth()) * channels,
+            Op::Depthwise { side } => rows * wide(side * side) * channels,
+            Op::Deconv => rows * wide(8 * x_channels) * channels,
+            Op::BatchNorm | Op::Gate => rows * channels,
             Op::WindowAttention { shape } => {
                 let window: [usize; 2] = shape.window();
                 let plane: usize = (0..2).map(|a| shape.extent[a].next_multiple_of(window[a])).product();
                 let tokens = window[0] * window[1];
-                plane * shape.heads * shape.key_dim * (3 * shape.part() + 25 + 2 * tokens + x_channels)
+                wide(plane * shape.heads * shape.key_dim) * wide(3 * shape.part() + 25 + 2 * tokens + x_channels)
             }
-            Op::Head { .. } => x.map_or(0, Tensor::rows) * x_channels * (2 * x_channels + operation.channels),
+            Op::Head { .. } => rows * wide(x_channels) * wide(2 * x_channels + operation.channels),
             _ => 0,
         };
-        count as u64
+        u64::try_from(count).unwrap_or(u64::MAX)
     }
 }
 

@@ -89,8 +89,19 @@ fn default_cameras() -> usize {
 /// Names that [`Network::built_in`] knows.
 pub const BUILT_IN: [&str; 3] = ["nuscenes-200", "nuscenes-256", "semantickitti-256"];
 
-/// No dimension of a network may exceed this: it keeps every size that is computed from them within 64 bits.
+/// No dimension of a network may exceed this: with [`MAX_VOXELS`] it keeps every size that is computed from them within
+/// 64 bits.
 const MAX_DIM: usize = 1 << 16;
+
+/// Blocks that a backbone stage may have; the deepest ResNet published has 48 in one. A graph has some ten operations per
+/// block, and planning looks at pairs of them.
+const MAX_DEPTH: usize = 256;
+
+/// Pixels that a side of the padded image may have: what a scene's images may have.
+const MAX_SIDE: usize = crate::scene::MAX_SIDE;
+
+/// Voxels that the output may have. `nuscenes-256` has 2^21.
+const MAX_VOXELS: u64 = 1 << 32;
 
 /// Attention heads of the EfficientViT block; fixed by the published architecture.
 pub const HEADS: usize = 8;
@@ -180,8 +191,15 @@ impl Network {
                 "[8, 16, 32], the strides of the backbone's last three stages",
             );
         }
-        if self.image.iter().any(|v| v % 32 != 0) {
-            return bad("image", format!("{:?}", self.image), "height and width padded to multiples of 32");
+        if self.depths.iter().any(|&v| v > MAX_DEPTH) {
+            return bad("depths", format!("{:?}", self.depths), "values from 1 to 256");
+        }
+        if self.image.iter().any(|&v| v % 32 != 0 || v > MAX_SIDE) {
+            return bad(
+                "image",
+                format!("{:?}", self.image),
+                "height and width padded to multiples of 32, up to 16384",
+            );
         }
         if self.block == Block::Basic && self.dcn.contains(&true) {
             return bad("dcn", format!("{:?}", self.dcn), "no deformable stage with basic blocks");
@@ -205,6 +223,12 @@ impl Network {
                     "each level exactly half of the one before, on every axis",
                 );
             }
+        }
+        // Dimensions are below 2^16, so this product and the eightfold of it need at most 51 bits.
+        let voxels = 8 * self.grids[0].iter().map(|&v| v as u64).product::<u64>();
+        if voxels > MAX_VOXELS {
+            let expected = format!("at most {MAX_VOXELS} voxels in the output, which has {voxels}");
+            return bad("grids", format!("{:?}", self.grids), &expected);
         }
         for (axis, [lo, hi]) in ["x", "y", "z"].iter().zip(self.bounds) {
             if !(lo.is_finite() && hi.is_finite() && lo < hi) {

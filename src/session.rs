@@ -114,6 +114,14 @@ fn coarse_len(graph: &Graph) -> usize {
     coarse.map(|o| graph.tensor(o.output).rows()).max().unwrap_or(0)
 }
 
+/// `len` zeros, unless the system has no memory for them.
+fn zeros<T: Clone + Default>(len: usize) -> Option<Vec<T>> {
+    let mut zeros = Vec::new();
+    zeros.try_reserve_exact(len).ok()?;
+    zeros.resize(len, T::default());
+    Some(zeros)
+}
+
 fn heads(graph: &Graph) -> impl Iterator<Item = &Operation> {
     graph.operations.iter().filter(|o| matches!(o.op, Op::Head { .. }))
 }
@@ -145,15 +153,16 @@ impl Session {
         let weights = graph.operations.iter().map(|o| model.part_refs(&graph, o)).collect::<Result<_>>()?;
         let arena = Arena::new(plan.len()).ok_or_else(|| too_large(plan.bytes()))?;
         let voxels: usize = model.network().output_grid().iter().product();
+        let output = || Error::new(ErrorKind::TooLarge, "the system has no memory for the session's output");
         let session = Self {
             weights,
             arena,
             isa: options.isa,
             threads: options.threads.clone(),
             cameras,
-            classes: vec![0; voxels],
-            coarse_classes: vec![0; coarse_len(&graph)],
-            logits: vec![0.0; logits_len(&graph, options)],
+            classes: zeros(voxels).ok_or_else(output)?,
+            coarse_classes: zeros(coarse_len(&graph)).ok_or_else(output)?,
+            logits: zeros(logits_len(&graph, options)).ok_or_else(output)?,
             keep_logits: options.logits,
             model,
             rig,
@@ -237,7 +246,8 @@ impl Session {
             return Err(Error::mismatch(format!("{} images, the rig has {} cameras", images.len(), self.cameras)));
         }
         for (i, image) in images.iter().enumerate() {
-            let padded = [image.height.next_multiple_of(32), image.width.next_multiple_of(32)];
+            let padded = [image.height, image.width].map(|v| v.checked_next_multiple_of(32).unwrap_or(0));
+            // The product is only taken of a size that pads to the network's, which is small.
             if padded != expected || image.bgr.len() != image.height * image.width * 3 {
                 return Err(Error::mismatch(format!(
                     "image {i}: {} bytes for {}x{} (height x width), the network expects a size that pads to {}x{}",

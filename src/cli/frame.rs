@@ -4,7 +4,7 @@ use super::Machine;
 use std::path::Path;
 use std::sync::Arc;
 use voxcast::rig::RigBuilder;
-use voxcast::{Error, Model, Result, Rig, Scene, SessionOptions};
+use voxcast::{Error, Model, Result, Rig, Scene, Session, SessionOptions};
 
 /// Calibration of a scene directory, of its calibration.json alone, or of a scene file.
 pub fn calibration(path: &Path) -> Result<Vec<[f32; 16]>> {
@@ -21,9 +21,23 @@ pub fn rig(path: Option<&Path>, model: &Model, scene: &Scene, options: &SessionO
     match path {
         Some(path) => Rig::open(path, model.network(), scene.cameras()),
         None => {
-            let mut builder = RigBuilder::new(model.network(), scene.cameras(), options.isa)?;
-            options.threads.install(|| builder.build(&scene.lidar2img))
+            let built = RigBuilder::new(model.network(), scene.cameras(), options.isa)
+                .and_then(|mut builder| options.threads.install(|| builder.build(&scene.lidar2img)));
+            built.map_err(|e| in_model(e, model))
         }
+    }
+}
+
+/// A session of `model`; what it cannot do is the model's doing.
+pub fn session(model: &Arc<Model>, rig: Arc<Rig>, options: &SessionOptions) -> Result<Session> {
+    Session::new(model.clone(), rig, options).map_err(|e| in_model(e, model))
+}
+
+/// The error, said of the model's file.
+fn in_model(error: Error, model: &Model) -> Error {
+    match model.path() {
+        Some(path) => error.in_file(path),
+        None => error,
     }
 }
 

@@ -49,13 +49,14 @@ impl Inspect {
         let options = SessionOptions { threads: self.threads.threads()?, ..SessionOptions::default() };
         let cameras = self.cameras.map_or(network.cameras, usize::from);
         let graph = model.graph(false, false);
-        let memory = Session::memory(&model, cameras, &options)?;
+        let memory = Session::memory(&model, cameras, &options).map_err(|e| e.in_file(&self.file))?;
         let parameters: usize = model.tensors().map(|(_, _, len)| len).sum();
         let multiply_adds: u64 = (0..graph.operations.len())
             .map(|i| {
-                graph.multiply_adds(&graph.operations[i]) * if i < graph.camera_operations { cameras as u64 } else { 1 }
+                let times = if i < graph.camera_operations { cameras as u64 } else { 1 };
+                graph.multiply_adds(&graph.operations[i]).saturating_mul(times)
             })
-            .sum();
+            .fold(0, u64::saturating_add);
         let rewrites = model.options().rewrites;
         if self.json {
             let value = serde_json::json!({

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use voxcast::graph::{Graph, Op};
 use voxcast::session::views;
-use voxcast::{Error, Isa, Result, Session, Threads};
+use voxcast::{Error, Isa, Result, Threads};
 
 /// Time every operation of a model on a scene: median, multiply-adds per second, and the share of this machine's own
 /// peak, which is measured between the frames.
@@ -58,7 +58,7 @@ impl Profile {
         let mut options = frame::options(&self.machine)?;
         options.unfolded = self.unfolded;
         let rig = Arc::new(frame::rig(self.rig.as_deref(), &model, &scene, &options)?);
-        let mut session = Session::new(model, rig, &options)?;
+        let mut session = frame::session(&model, rig, &options)?;
         let graph = session.graph().clone();
         let images = views(&scene);
         let index_of: std::collections::BTreeMap<&str, usize> =

@@ -10,7 +10,7 @@ use voxcast::npz::{Array, Elements, write_npz};
 use voxcast::picture::{self, Figure, Palette};
 use voxcast::scene::forward_of;
 use voxcast::session::{Occupancy, views};
-use voxcast::{Network, Result, Scene, Session};
+use voxcast::{Network, Result, Scene};
 
 /// Run a model on a scene and write the class of every voxel.
 #[derive(Args, Debug)]
@@ -73,7 +73,7 @@ impl Run {
         let start = Instant::now();
         let rig = Arc::new(frame::rig(self.rig.as_deref(), &model, &scene, &options)?);
         let rig_time = start.elapsed();
-        let mut session = Session::new(model.clone(), rig.clone(), &options)?;
+        let mut session = frame::session(&model, rig.clone(), &options)?;
 
         let graph = session.graph().clone();
         let total = graph.camera_operations * scene.cameras() + graph.operations.len() - graph.camera_operations;

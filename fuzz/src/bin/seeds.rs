@@ -7,10 +7,14 @@ mod pth;
 
 use pth::{Entry, Tensor, Wrap};
 use std::path::Path;
+use voxcast::graph::Rewrites;
+use voxcast::model::Options;
+use voxcast::rig::RigBuilder;
+use voxcast::weights::Precision;
 
 fn main() -> std::io::Result<()> {
     let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus");
-    for (target, seeds) in [("checkpoint", checkpoints())] {
+    for (target, seeds) in [("checkpoint", checkpoints()), ("model", models()), ("rig", rigs())] {
         let dir = corpus.join(target);
         std::fs::create_dir_all(&dir)?;
         for (name, bytes) in &seeds {
@@ -19,6 +23,39 @@ fn main() -> std::io::Result<()> {
         println!("{}: {} seeds", dir.display(), seeds.len());
     }
     Ok(())
+}
+
+/// The headers of sound models, behind a byte that chooses the weights.
+fn models() -> Vec<(String, Vec<u8>)> {
+    let mut seeds = Vec::new();
+    for (precision, name) in [(Precision::F32, "f32"), (Precision::F16, "f16")] {
+        for (rewrites, fold) in [(Rewrites::ALL, "all"), (Rewrites::NONE, "none")] {
+            let file = voxcast_fuzz::model_bytes(Options { precision, rewrites });
+            for kind in 0..4u8 {
+                let seed = [&[kind][..], voxcast_fuzz::split(&file).0.trim_ascii_end()].concat();
+                seeds.push((format!("{name}-{fold}-{kind}"), seed));
+            }
+        }
+    }
+    seeds
+}
+
+/// Edits, and a whole rig.
+fn rigs() -> Vec<(String, Vec<u8>)> {
+    let path = std::env::temp_dir().join(format!("voxcast-fuzz-rig-{}", std::process::id()));
+    let network = voxcast_fuzz::network();
+    let camera = [20., 0., 8., 30., 0., 20., 0., 15., 0.1, 0., 0.5, 1., 0., 0., 0., 1.];
+    let rig = RigBuilder::new(&network, 2).and_then(|mut b| b.build(&[camera; 2])).expect("a small rig");
+    rig.save(&path, &network).expect("room for a small file");
+    let file = std::fs::read(&path).expect("what was just written");
+    std::fs::remove_file(&path).expect("what was just read");
+    vec![
+        ("nothing".into(), vec![]),
+        ("more-entries".into(), [[1, 7, 3, 0, 60], [3, 7, 0, 0, 9], [9, 7, 0, 0, 1]].concat()),
+        ("other-pixels".into(), [[1, 1, 7, 0, 1], [5, 3, 1, 0, 0], [0, 2, 3, 0, 1]].concat()),
+        ("lengths".into(), [[0, 4, 1, 0, 0], [2, 5, 1, 0, 0], [1, 6, 9, 0, 0]].concat()),
+        ("file".into(), file),
+    ]
 }
 
 fn checkpoints() -> Vec<(String, Vec<u8>)> {

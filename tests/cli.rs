@@ -1,0 +1,660 @@
+//! The program from outside: what it does, what it prints, how it ends; and every kind of input that is at fault.
+
+#[path = "support/pth.rs"]
+#[allow(dead_code, reason = "the checkpoint tests use the rest")]
+mod pth;
+#[path = "support/small.rs"]
+#[allow(dead_code, reason = "other tests use the rest")]
+mod small;
+
+use serde_json::{Value, json};
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use voxcast::graph::Rewrites;
+use voxcast::import::{Source, import};
+use voxcast::model::Options;
+use voxcast::npz::{OwnedElements, read_npz};
+use voxcast::{Network, Result};
+
+/// Address space for a program that is given hostile input: more than any of these networks needs, less than any lie.
+const KILOBYTES: usize = 4 << 20;
+
+fn voxcast(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_voxcast")).args(arguments).output().unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8(bytes.to_vec()).unwrap()
+}
+
+/// The standard output of a run that must succeed, and must say nothing else.
+fn done(arguments: &[&str]) -> String {
+    let output = voxcast(arguments);
+    assert_eq!((output.status.code(), text(&output.stderr)), (Some(0), String::new()), "{arguments:?}");
+    text(&output.stdout)
+}
+
+/// Runs where memory is scarce.
+fn bounded(arguments: &[&str]) -> Output {
+    if !cfg!(target_os = "linux") {
+        return voxcast(arguments);
+    }
+    let script = format!("ulimit -v {KILOBYTES}; exec \"$0\" \"$@\"");
+    let program = env!("CARGO_BIN_EXE_voxcast");
+    Command::new("sh").args(["-c", &script, program]).args(arguments).output().unwrap()
+}
+
+/// The one line of a run that must fail cleanly. It names `file`.
+fn refused(file: &str, arguments: &[&str]) -> String {
+    let output = bounded(arguments);
+    assert_refused(&output, file, &format!("{arguments:?}"))
+}
+
+fn assert_refused(output: &Output, file: &str, what: &str) -> String {
+    let line = text(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{what}: {line}");
+    assert!(line.starts_with("voxcast: ") && line.ends_with('\n') && line.lines().count() == 1, "{what}: {line:?}");
+    assert!(line.contains(file), "{what}: {line:?} does not name {file}");
+    assert!(!line.contains("panicked") && line.len() < 4000, "{what}: {line:?}");
+    line
+}
+
+/// For damage that nobody can detect: success, or a clean failure.
+fn refused_or_done(file: &str, arguments: &[&str]) {
+    let output = bounded(arguments);
+    if output.status.code() != Some(0) {
+        assert_refused(&output, file, &format!("{arguments:?}"));
+    }
+}
+
+/// Weights that write down what they were asked for.
+struct Recorder(RefCell<BTreeMap<String, (Vec<usize>, Vec<f32>)>>);
+
+impl Source for Recorder {
+    fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>> {
+        let values: Vec<f32> = small::Weights(3).tensor(name, shape)?.into_iter().map(|v| v as f32).collect();
+        self.0.borrow_mut().insert(name.to_owned(), (shape.to_vec(), values.clone()));
+        Ok(values.into_iter().map(f64::from).collect())
+    }
+}
+
+type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
+
+fn network() -> Network {
+    Network { image: [32, 64], grids: [[8, 12, 4], [4, 6, 2], [2, 3, 1]], depths: [1; 4], ..small::network() }
+}
+
+/// A directory with a network, its checkpoint in both formats, a scene; and, once asked for, a model and a rig.
+struct Place(tempfile::TempDir);
+
+impl Place {
+    fn new() -> Self {
+        let place = Self(tempfile::tempdir().unwrap());
+        fs::write(place.path("network.json"), network().to_json()).unwrap();
+        let recorder = Recorder(RefCell::default());
+        let options = Options { rewrites: Rewrites::NONE, ..Options::default() };
+        import(&recorder, &network(), options, &place.path("recorded"), &mut |_, _| ()).unwrap();
+        fs::remove_file(place.path("recorded")).unwrap();
+        let tensors = recorder.0.into_inner();
+        fs::write(place.path("weights.pth"), pth_bytes(&tensors)).unwrap();
+        fs::write(place.path("weights.safetensors"), plain_bytes(&tensors)).unwrap();
+        voxcast::demo::demo_scene(&network(), 1).save(&place.path("scene")).unwrap();
+        place
+    }
+
+    /// With model and rig.
+    fn ready() -> Self {
+        let place = Self::new();
+        let [network, weights, model] = ["network.json", "weights.pth", "model"].map(|f| place.text(f));
+        done(&["import", &weights, "--network", &network, "-o", &model]);
+        done(&["rig", &place.text("scene"), "--model", &model, "-o", &place.text("rig")]);
+        place
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.path().join(name)
+    }
+
+    fn text(&self, name: &str) -> String {
+        self.path(name).to_str().unwrap().to_owned()
+    }
+
+    fn tensors(&self) -> Tensors {
+        let checkpoint = voxcast::checkpoint::Checkpoint::open(self.path("weights.pth")).unwrap();
+        let tensor = |name: &str| {
+            let view = checkpoint.get(name).unwrap();
+            (name.to_owned(), (view.shape().to_vec(), view.to_f32().unwrap()))
+        };
+        checkpoint.names().map(tensor).collect()
+    }
+
+    fn import(&self, weights: &str, network: &str) -> [String; 6] {
+        let [weights, network, out] = [weights, network, "out"].map(|f| self.text(f));
+        ["import".into(), weights, "--network".into(), network, "-o".into(), out]
+    }
+
+    fn run(&self, model: &str, rig: &str, scene: &str) -> Vec<String> {
+        let [model, rig, scene, out] = [model, rig, scene, "out.npz"].map(|f| self.text(f));
+        ["run", "--model", &model, "--rig", &rig, &scene, "-o", &out].map(str::to_owned).to_vec()
+    }
+}
+
+fn words(arguments: &[String]) -> Vec<&str> {
+    arguments.iter().map(String::as_str).collect()
+}
+
+fn pth_bytes(tensors: &Tensors) -> Vec<u8> {
+    let tensors: Vec<(&str, pth::Tensor)> = tensors
+        .iter()
+        .map(|(name, (shape, values))| {
+            let shape: Vec<i64> = shape.iter().map(|&v| v as i64).collect();
+            (name.as_str(), pth::Tensor::f32(&shape, values))
+        })
+        .collect();
+    pth::pth(2, pth::Wrap::Runner, &tensors)
+}
+
+fn plain_bytes(tensors: &Tensors) -> Vec<u8> {
+    let (mut header, mut data) = (serde_json::Map::new(), Vec::new());
+    for (name, (shape, values)) in tensors {
+        let from = data.len();
+        data.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+        header.insert(name.clone(), json!({"dtype": "F32", "shape": shape, "data_offsets": [from, data.len()]}));
+    }
+    let header = Value::Object(header).to_string();
+    [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), &data].concat()
+}
+
+/// Lengths to cut a file of `len` bytes to.
+fn cuts(len: usize) -> Vec<usize> {
+    vec![0, 1, 7, 8, 9, 64, 1000, len / 3, len / 2, len - 1000, len - 64, len - 1]
+}
+
+/// Bits to flip in a file of `len` bytes: some of the start, which headers are, and some all over.
+fn flips(len: usize) -> Vec<usize> {
+    let start = [0, 3, 7, 8, 20, 41, 100, 150, 230].into_iter().map(|at| at * 8 + at % 8);
+    start.chain((0..8).map(|i| (i * (len - 1) / 7) * 8 + i)).collect()
+}
+
+fn flip(bytes: &[u8], bit: usize) -> Vec<u8> {
+    let mut bytes = bytes.to_vec();
+    bytes[bit / 8] ^= 1 << (bit % 8);
+    bytes
+}
+
+#[test]
+fn the_whole_path() {
+    let place = Place::new();
+    let [net, pth, plain, model, half, rig, scene, out, dump] =
+        ["network.json", "weights.pth", "weights.safetensors", "model", "half", "rig", "scene", "out.npz", "dump"]
+            .map(|f| place.text(f));
+    done(&["import", &pth, "--network", &net, "-o", &model]);
+    let first = fs::read(&model).unwrap();
+    done(&["import", &plain, "--network", &net, "-o", &model]);
+    assert_eq!(fs::read(&model).unwrap(), first, "both formats hold the same weights");
+    done(&["import", &pth, "--network", &net, "--precision", "f16", "-o", &half]);
+    assert!(fs::metadata(&half).unwrap().len() < first.len() as u64);
+
+    done(&["rig", &scene, "--model", &model, "-o", &rig]);
+    let built = fs::read(&rig).unwrap();
+    done(&["rig", &place.text("scene/calibration.json"), "--model", &model, "-o", &rig, "--threads", "3"]);
+    assert_eq!(fs::read(&rig).unwrap(), built);
+
+    let run = |more: &[&str]| -> Value {
+        let arguments = [&["run", "--model", &model, &scene, "-o", &out, "--json"][..], more].concat();
+        serde_json::from_str(&done(&arguments)).unwrap()
+    };
+    let summary = run(&["--logits", "--rig", &rig]);
+    let arrays = read_npz(Path::new(&out)).unwrap();
+    assert_eq!((arrays[0].name.as_str(), &arrays[0].shape[..]), ("classes", &[16, 24, 8][..]));
+    assert_eq!((arrays[1].name.as_str(), &arrays[1].shape[..]), ("logits", &[16, 24, 8, 19][..]));
+    let OwnedElements::U8(classes) = &arrays[0].elements else { panic!("classes are bytes") };
+    for (class, count) in summary["counts"].as_array().unwrap().iter().enumerate() {
+        assert_eq!(count.as_u64().unwrap() as usize, classes.iter().filter(|&&c| usize::from(c) == class).count());
+    }
+    let png = place.text("out.png");
+    for more in [
+        &["--threads", "1"][..],
+        &["--threads", "5", "--rig", &rig],
+        &["--isa", "scalar"],
+        &["--png", &png],
+        &["--dump", &dump, "--stages", "level1.fused,logits.lvl2"],
+    ] {
+        assert_eq!(run(more)["digest"], summary["digest"], "{more:?}");
+    }
+    assert!(fs::read(&png).unwrap().starts_with(b"\x89PNG"));
+    run(&["--dump", &dump]);
+    let stages = fs::read(place.path("dump/stages.safetensors")).unwrap();
+    let stages = safetensors::SafeTensors::deserialize(&stages).unwrap();
+    assert_eq!(stages.tensor("level1.gather.volume").unwrap().shape(), [1, 17, 8, 12, 4]);
+    assert_eq!(stages.tensor("backbone.c5").unwrap().shape(), [2, 96, 1, 2]);
+    assert_eq!(stages.tensor("classes").unwrap().shape(), [16, 24, 8]);
+
+    let inspected: Value = serde_json::from_str(&done(&["inspect", &model, "--json", "--threads", "2"])).unwrap();
+    assert_eq!((&inspected["kind"], &inspected["network"]["classes"]), (&json!("model"), &json!(19)));
+    assert!(inspected["session_bytes"].as_u64() > inspected["arena_bytes"].as_u64());
+    let inspected: Value = serde_json::from_str(&done(&["inspect", &rig, "--json"])).unwrap();
+    assert_eq!((&inspected["kind"], &inspected["cameras"]), (&json!("rig"), &json!(2)));
+    for more in ["--operations", "--plan", "--tensors"] {
+        assert!(done(&["inspect", &model, more]).contains("refine_lvl0"), "{more}");
+    }
+    assert!(done(&["inspect", &rig]).contains("level 3"));
+
+    let trace = place.text("trace.json");
+    let profile = done(&["profile", "--model", &model, &scene, "--repeat", "1", "--json", "--trace", &trace]);
+    let profile: Value = serde_json::from_str(&profile).unwrap();
+    assert!(profile["rows"].as_array().unwrap().len() > 50);
+    serde_json::from_slice::<Value>(&fs::read(&trace).unwrap()).unwrap();
+    for by in ["part", "kind", "operation"] {
+        assert!(done(&["profile", "--model", &model, &scene, "--repeat", "1", "--by", by]).contains("GMAC/s"));
+    }
+}
+
+#[test]
+fn the_demo_needs_no_other_file() {
+    let place = tempfile::tempdir().unwrap();
+    let directory = place.path().join("a/b").to_str().unwrap().to_owned();
+    let told = done(&["demo", "-o", &directory, "--threads", "2"]);
+    let digest = told.split("digest ").nth(1).unwrap().split_whitespace().next().unwrap();
+    let file = |name: &str| format!("{directory}/{name}");
+    let (model, scene, out) = (file("model.safetensors"), file("scene"), file("again.npz"));
+    let again = done(&["run", "--model", &model, &scene, "-o", &out]);
+    assert!(again.contains(digest), "{again} {told}");
+    assert_eq!(fs::read(file("occupancy.npz")).unwrap(), fs::read(&out).unwrap());
+    assert!(fs::read(file("occupancy.png")).unwrap().starts_with(b"\x89PNG"));
+}
+
+#[test]
+fn help_and_usage() {
+    assert!(done(&["--version"]).starts_with("voxcast "));
+    let help = done(&["--help"]);
+    for command in ["demo", "import", "rig", "run", "inspect", "profile"] {
+        assert!(help.contains(command));
+        assert!(done(&[command, "--help"]).contains("Examples:"), "{command}");
+        assert!(done(&["help", command]).contains("Usage:"), "{command}");
+    }
+    for bad in [
+        &[][..],
+        &["nonsense"],
+        &["run"],
+        &["run", "scene"],
+        &["run", "--model", "m", "scene"],
+        &["run", "--model", "m", "scene", "-o", "x", "--stages", "a"],
+        &["run", "--model", "m", "scene", "-o", "x", "--threads", "0"],
+        &["run", "--model", "m", "scene", "-o", "x", "--threads", "many"],
+        &["run", "--model", "m", "scene", "-o", "x", "--nonsense"],
+        &["import", "a.pth", "-o", "b"],
+        &["import", "a.pth", "--network", "x", "-o", "b", "--precision", "f8"],
+        &["import", "a.pth", "--network", "x", "-o", "b", "--fold", "paper"],
+        &["rig", "--model", "m", "-o", "x"],
+        &["inspect"],
+        &["inspect", "m", "--cameras", "65"],
+        &["profile", "--model", "m", "scene", "--by", "day"],
+        &["profile", "--model", "m", "scene", "--repeat", "0"],
+        &["demo", "--seed", "-1"],
+    ] {
+        let output = voxcast(bad);
+        assert_eq!((output.status.code(), output.stdout.is_empty()), (Some(2), true), "{bad:?}");
+        assert!(text(&output.stderr).contains("--help"), "{bad:?}");
+    }
+}
+
+#[test]
+fn files_that_are_not_there() {
+    let place = Place::ready();
+    let nothing = place.text("nothing");
+    let [net, weights, model, rig, scene, out] =
+        ["network.json", "weights.pth", "model", "rig", "scene", "out.npz"].map(|f| place.text(f));
+    refused(&nothing, &["import", &nothing, "--network", &net, "-o", &out]);
+    refused(&nothing, &["import", &weights, "--network", &nothing, "-o", &out]);
+    refused(&nothing, &["rig", &nothing, "--model", &model, "-o", &out]);
+    refused(&nothing, &["rig", &scene, "--model", &nothing, "-o", &out]);
+    refused(&nothing, &["run", "--model", &nothing, &scene, "-o", &out]);
+    refused(&nothing, &["run", "--model", &model, &nothing, "-o", &out]);
+    refused(&nothing, &["run", "--model", &model, "--rig", &nothing, &scene, "-o", &out]);
+    refused(&nothing, &["inspect", &nothing]);
+    refused(&nothing, &["profile", "--model", &nothing, &scene]);
+    assert!(!place.path("out.npz").exists());
+
+    // Directories where files belong, and the other way round.
+    refused(&scene, &["inspect", &scene]);
+    refused(&scene, &["import", &scene, "--network", &net, "-o", &out]);
+    refused(&scene, &["import", &weights, "--network", &scene, "-o", &out]);
+    refused(&model, &["run", "--model", &model, &model, "-o", &out]);
+    refused(&scene, &["run", "--model", &model, &scene, "-o", &scene]);
+    refused(&scene, &["import", &weights, "--network", &net, "-o", &scene]);
+    refused(&scene, &["rig", &scene, "--model", &model, "-o", &scene]);
+
+    let missing = place.text("no/such/out");
+    refused(&missing, &["run", "--model", &model, &scene, "-o", &missing]);
+    refused(&missing, &["run", "--model", &model, &scene, "-o", &out, "--png", &missing]);
+    refused(&missing, &["import", &weights, "--network", &net, "-o", &missing]);
+    refused(&missing, &["rig", &scene, "--model", &model, "-o", &missing]);
+    refused(&missing, &["profile", "--model", &model, &scene, "--repeat", "1", "--trace", &missing]);
+    let inside = place.text("model/demo");
+    refused(&inside, &["demo", "-o", &inside]);
+    refused(&inside, &["run", "--model", &model, &scene, "-o", &out, "--dump", &inside]);
+
+    let image = fs::read_dir(place.path("scene")).unwrap().map(|e| e.unwrap().path());
+    let image = image.filter(|p| p.extension().is_some_and(|e| e == "png")).min().unwrap();
+    fs::remove_file(&image).unwrap();
+    refused(image.to_str().unwrap(), &["run", "--model", &model, "--rig", &rig, &scene, "-o", &out]);
+}
+
+#[test]
+fn names_and_numbers_that_are_unknown() {
+    let place = Place::ready();
+    let [weights, model, scene, out, dump] =
+        ["weights.pth", "model", "scene", "out.npz", "dump"].map(|f| place.text(f));
+    let line = refused("nuscenes-999", &["import", &weights, "--network", "nuscenes-999", "-o", &out]);
+    assert!(line.contains("nuscenes-200"), "{line}");
+    let line = refused("--isa", &["run", "--model", &model, &scene, "-o", &out, "--isa", "mmx"]);
+    assert!(line.contains("scalar, avx2"), "{line}");
+    let line = refused("no stage", &["run", "--model", &model, &scene, "-o", &out, "--dump", &dump, "--stages", "c9"]);
+    assert!(line.contains("\"c9\"") && line.contains("logits.lvl0"), "{line}");
+    // The wrong published network for these weights.
+    let line = refused(&weights, &["import", &weights, "--network", "nuscenes-200", "-o", &out]);
+    assert!(line.contains("img_backbone.") && line.contains("expects"), "{line}");
+}
+
+#[test]
+fn damaged_models_and_rigs() {
+    let place = Place::ready();
+    for name in ["model", "rig"] {
+        let bytes = fs::read(place.path(name)).unwrap();
+        let damaged = cuts(bytes.len()).into_iter().map(|n| bytes[..n].to_vec());
+        let damaged = damaged.chain(flips(bytes.len()).into_iter().map(|bit| flip(&bytes, bit)));
+        let bad = place.text("bad");
+        let run = if name == "model" { place.run("bad", "rig", "scene") } else { place.run("model", "bad", "scene") };
+        for (i, damaged) in damaged.enumerate() {
+            fs::write(&bad, damaged).unwrap();
+            refused(&bad, &["inspect", &bad]);
+            if i % 4 == 0 {
+                refused(&bad, &words(&run));
+            }
+        }
+    }
+    // Sound files of the other kind.
+    let [model, rig] = ["model", "rig"].map(|f| place.text(f));
+    refused(&rig, &words(&place.run("rig", "rig", "scene")));
+    refused(&model, &words(&place.run("model", "model", "scene")));
+    let weights = place.text("weights.safetensors");
+    refused(&weights, &words(&place.run("weights.safetensors", "rig", "scene")));
+    refused(&weights, &words(&place.run("model", "weights.safetensors", "scene")));
+    refused(&weights, &["inspect", &weights]);
+    assert!(!place.path("out.npz").exists());
+}
+
+#[test]
+fn rigs_that_do_not_belong_here() {
+    let place = Place::ready();
+    let other = Network { grids: [[16, 12, 4], [8, 6, 2], [4, 3, 1]], ..network() };
+    let bad = place.text("bad");
+    small::rig(&other, 0.3).save(Path::new(&bad), &other).unwrap();
+    let line = refused(&bad, &words(&place.run("model", "bad", "scene")));
+    assert!(line.contains("grids"), "{line}");
+    let three = Network { cameras: 3, ..network() };
+    small::rig(&three, 0.3).save(Path::new(&bad), &three).unwrap();
+    let line = refused(&bad, &words(&place.run("model", "bad", "scene")));
+    assert!(line.contains("3 cameras"), "{line}");
+
+    // Plain rigs, which other programs write: no checksum guards their numbers.
+    let bytes = fs::read(place.path("rig")).unwrap();
+    let rig = safetensors::SafeTensors::deserialize(&bytes).unwrap();
+    let plain = |name: &str, edit: &dyn Fn(&mut Vec<u32>)| {
+        let (mut header, mut data) = (serde_json::Map::new(), Vec::new());
+        for (key, tensor) in rig.tensors() {
+            let mut words: Vec<u32> = tensor.data().as_chunks().0.iter().map(|&b| u32::from_le_bytes(b)).collect();
+            if key == name {
+                edit(&mut words);
+            }
+            let from = data.len();
+            data.extend(words.iter().flat_map(|w| w.to_le_bytes()));
+            header.insert(key, json!({"dtype": "U32", "shape": [words.len()], "data_offsets": [from, data.len()]}));
+        }
+        let header = Value::Object(header).to_string();
+        [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), &data].concat()
+    };
+    fs::write(&bad, plain("", &|_| ())).unwrap();
+    done(&words(&place.run("model", "bad", "scene")));
+    let cases: [(&str, &dyn Fn(&mut Vec<u32>), &str); 7] = [
+        ("level1.volume.col", &|w| *w.last_mut().unwrap() = u32::MAX, "4294967295"),
+        ("level3.bev.col", &|w| *w.last_mut().unwrap() = 4, "less than 4"),
+        ("level1.bev.ptr", &|w| w[5] = u32::MAX, "row 4"),
+        ("level2.volume.ptr", &|w| w[0] = 1, "row 0 starts at entry 1"),
+        ("level2.volume.ptr", &|w| w[3] = 0, "level2.volume.ptr: row"),
+        ("level2.bev.ptr", &|w| w.truncate(24), "level2.bev.ptr has 23 rows, expected 24"),
+        ("level3.volume.ptr", &|w| *w.last_mut().unwrap() += 1, "the length of"),
+    ];
+    for (name, edit, expected) in cases {
+        fs::write(&bad, plain(name, edit)).unwrap();
+        let line = refused(&bad, &words(&place.run("model", "bad", "scene")));
+        assert!(line.contains(name) && line.contains(expected), "{name}: {line}");
+    }
+    let bytes = plain("", &|_| ());
+    for bit in flips(bytes.len()) {
+        fs::write(&bad, flip(&bytes, bit)).unwrap();
+        refused_or_done(&bad, &words(&place.run("model", "bad", "scene")));
+    }
+}
+
+#[test]
+fn damaged_checkpoints_leave_the_old_model() {
+    let place = Place::new();
+    let out = place.path("out");
+    for name in ["weights.pth", "weights.safetensors"] {
+        let bytes = fs::read(place.path(name)).unwrap();
+        let bad = place.text("bad");
+        for n in cuts(bytes.len()) {
+            fs::write(&out, "the old model").unwrap();
+            fs::write(&bad, &bytes[..n]).unwrap();
+            refused(&bad, &words(&place.import("bad", "network.json")));
+            assert_eq!(fs::read(&out).unwrap(), b"the old model", "{name} cut to {n}");
+        }
+        for bit in flips(bytes.len()) {
+            fs::write(&out, "the old model").unwrap();
+            fs::write(&bad, flip(&bytes, bit)).unwrap();
+            refused_or_done(&bad, &words(&place.import("bad", "network.json")));
+            let model = fs::read(&out).unwrap();
+            assert!(model == b"the old model" || voxcast::Model::from_bytes(model).is_ok(), "{name}, bit {bit}");
+        }
+        let left: Vec<_> = fs::read_dir(place.path("")).unwrap().map(|e| e.unwrap().file_name()).collect();
+        assert!(!left.iter().any(|f| f.to_string_lossy().ends_with(".tmp")), "{left:?}");
+    }
+}
+
+#[test]
+fn weights_that_cannot_be_used_are_named() {
+    let place = Place::new();
+    let sound = place.tensors();
+    let edits: [(&str, &dyn Fn(&mut Tensors), &str); 6] = [
+        ("img_backbone.conv1.weight", &|t| t.get_mut("img_backbone.conv1.weight").unwrap().1[7] = f32::NAN, "NaN"),
+        ("img_neck.fpn_convs.1.conv.bias", &|t| drop(t.remove("img_neck.fpn_convs.1.conv.bias")), "missing"),
+        (
+            "occ_head.mlp_occ_lvl0.4.bias",
+            &|t| t.get_mut("occ_head.mlp_occ_lvl0.4.bias").unwrap().1[2] = f32::INFINITY,
+            "inf",
+        ),
+        (
+            "img_backbone.bn1.running_var",
+            &|t| t.get_mut("img_backbone.bn1.running_var").unwrap().1[1] = -1.0,
+            "variance",
+        ),
+        (
+            "view_transformer.up_sample1.0.weight",
+            &|t| t.get_mut("view_transformer.up_sample1.0.weight").unwrap().0.swap(0, 1),
+            "expects",
+        ),
+        (
+            "img_backbone.layer1.0.conv1",
+            &|t| t.get_mut("img_backbone.layer1.0.conv1.weight").unwrap().1.fill(f32::MAX),
+            "finite",
+        ),
+    ];
+    for (name, edit, expected) in edits {
+        let mut tensors = sound.clone();
+        edit(&mut tensors);
+        for (file, bytes) in [("bad.pth", pth_bytes(&tensors)), ("bad.safetensors", plain_bytes(&tensors))] {
+            fs::write(place.path(file), bytes).unwrap();
+            fs::write(place.path("out"), "the old model").unwrap();
+            let line = refused(&place.text(file), &words(&place.import(file, "network.json")));
+            assert!(line.contains(name) && line.contains(expected), "{line}");
+            assert_eq!(fs::read(place.path("out")).unwrap(), b"the old model");
+        }
+    }
+    // Half precision cannot hold it.
+    let mut tensors = sound.clone();
+    tensors.get_mut("occ_head.mlp_occ_lvl0.4.weight").unwrap().1[0] = 1e6;
+    fs::write(place.path("bad.pth"), pth_bytes(&tensors)).unwrap();
+    done(&words(&place.import("bad.pth", "network.json")));
+    let import = place.import("bad.pth", "network.json");
+    let import = [&words(&import)[..], &["--precision", "f16"]].concat();
+    let line = refused("bad.pth", &import);
+    assert!(line.contains("mlp_occ_lvl0") && line.contains("65504"), "{line}");
+}
+
+#[test]
+fn a_pickle_that_would_call_something_is_refused() {
+    let place = Place::new();
+    let marker = place.text("marker");
+    for (module, name) in [("os", "system"), ("builtins", "eval"), ("posix", "system"), ("subprocess", "check_output")]
+    {
+        let evil = pth::Pickle::new(2).global(module, name).text(&format!("touch {marker}")).raw(b"\x85R").stop();
+        fs::write(place.path("evil.pth"), pth::pth_of(evil, &["0"])).unwrap();
+        let line = refused("evil.pth", &words(&place.import("evil.pth", "network.json")));
+        assert!(line.contains(&format!("{module}.{name}")) || line.contains(&format!("{module} {name}")), "{line}");
+        assert!(!Path::new(&marker).exists());
+    }
+}
+
+#[test]
+fn damaged_scenes() {
+    let place = Place::ready();
+    let run = place.run("model", "rig", "scene");
+    done(&words(&run));
+    let entries = fs::read_dir(place.path("scene")).unwrap().map(|e| e.unwrap().path());
+    let image = entries.filter(|p| p.extension().is_some_and(|e| e == "png")).min().unwrap();
+    let sound = fs::read(&image).unwrap();
+    for n in cuts(sound.len()) {
+        fs::write(&image, &sound[..n]).unwrap();
+        refused_or_done(image.to_str().unwrap(), &words(&run));
+        if n < sound.len() / 2 {
+            refused(image.to_str().unwrap(), &words(&run));
+        }
+    }
+    for bit in flips(sound.len()) {
+        fs::write(&image, flip(&sound, bit)).unwrap();
+        refused_or_done(image.to_str().unwrap(), &words(&run));
+    }
+    fs::write(&image, &sound).unwrap();
+
+    let calibration = place.path("scene/calibration.json");
+    let sound = fs::read_to_string(&calibration).unwrap();
+    let named = calibration.to_str().unwrap();
+    for n in [0, 1, 10, sound.len() / 2, sound.len() - 3] {
+        fs::write(&calibration, &sound[..n]).unwrap();
+        refused(named, &words(&run));
+        refused(named, &["rig", named, "--model", &place.text("model"), "-o", &place.text("out")]);
+    }
+    for (from, to) in [
+        ("\"lidar2img\"", "\"lidar\""),
+        ("\"width\":64", "\"width\":65"),
+        ("\"width\":64", "\"width\":-64"),
+        ("\"width\":64", "\"width\":1e99"),
+        ("\"file\":\"", "\"file\":\"../"),
+        ("\"cameras\"", "\"kameras\""),
+        ("[", "[null,"),
+    ] {
+        assert!(sound.contains(from), "{from} in {sound}");
+        fs::write(&calibration, sound.replacen(from, to, 1)).unwrap();
+        refused(&place.text("scene"), &words(&run));
+    }
+    // A sound scene of the wrong size.
+    let other = Network { image: [64, 64], ..network() };
+    voxcast::demo::demo_scene(&other, 1).save(&place.path("other")).unwrap();
+    let line = refused(&place.text("other"), &words(&place.run("model", "rig", "other")));
+    assert!(line.contains("64x64") && line.contains("32x64"), "{line}");
+    // And of another number of cameras.
+    let other = Network { cameras: 1, ..network() };
+    voxcast::demo::demo_scene(&other, 1).save(&place.path("one")).unwrap();
+    let line = refused(&place.text("rig"), &words(&place.run("model", "rig", "one")));
+    assert!(line.contains("2 cameras, expected 1"), "{line}");
+}
+
+#[test]
+fn absurd_networks() {
+    let place = Place::new();
+    let sound = serde_json::to_value(network()).unwrap();
+    let cases = [
+        ("depths", json!([65536, 1, 1, 1]), "depths"),
+        ("depths", json!([0, 1, 1, 1]), "depths"),
+        ("depths", json!([1, 1, 1]), "length 3"),
+        ("width", json!(0), "width"),
+        ("width", json!(-1), "-1"),
+        ("width", json!(1e300), "1e"),
+        ("width", json!(u64::MAX), "width"),
+        ("fpn", json!("many"), "many"),
+        ("channels", json!([1, 2, 3, 4]), "channels"),
+        ("key_dims", json!([1, 1, 1]), "key_dims"),
+        ("image", json!([31, 64]), "image"),
+        ("image", json!([65536, 65536]), "image"),
+        ("grids", json!([[32768, 32768, 4096], [16384, 16384, 2048], [8192, 8192, 1024]]), "grids"),
+        ("grids", json!([[8, 12, 4], [4, 6, 2], [2, 3, 2]]), "grids"),
+        ("grids", json!([[0, 0, 0], [0, 0, 0], [0, 0, 0]]), "grids"),
+        ("bounds", json!([[1, 0], [0, 1], [0, 1]]), "bounds"),
+        ("bounds", json!([[0, 1e60], [0, 1], [0, 1]]), ""),
+        ("classes", json!(1), "classes"),
+        ("classes", json!(300), "classes"),
+        ("samples", json!([1, 2, 0]), "samples"),
+        ("strides", json!([4, 8, 16]), "strides"),
+        ("cameras", json!(0), "cameras"),
+        ("sampling", json!("random"), "random"),
+        ("block", json!("vgg"), "vgg"),
+        ("nonsense", json!(1), "nonsense"),
+    ];
+    for (key, value, expected) in cases {
+        let mut network = sound.clone();
+        network[key] = value;
+        fs::write(place.path("bad.json"), network.to_string()).unwrap();
+        let line = refused("bad.json", &words(&place.import("weights.pth", "bad.json")));
+        assert!(line.contains(expected), "{key}: {line}");
+    }
+    let whole = sound.to_string();
+    for n in [0, 1, whole.len() / 2, whole.len() - 1] {
+        fs::write(place.path("bad.json"), &whole[..n]).unwrap();
+        refused("bad.json", &words(&place.import("weights.pth", "bad.json")));
+    }
+    fs::write(place.path("bad.json"), "[".repeat(100_000)).unwrap();
+    refused("bad.json", &words(&place.import("weights.pth", "bad.json")));
+    fs::write(place.path("bad.json"), b"\xff\xfe{}").unwrap();
+    refused("bad.json", &words(&place.import("weights.pth", "bad.json")));
+}
+
+/// Sizes that the weights do not show and that no machine of this memory can hold.
+#[test]
+fn sizes_beyond_memory_are_refused_before_they_are_taken() {
+    let place = Place::new();
+    let sound = serde_json::to_value(network()).unwrap();
+    let cases = [
+        // More rows than a matrix may have.
+        ("grids", json!([[8, 49152, 1024], [4, 24576, 512], [2, 12288, 256]]), "voxels"),
+        ("samples", json!([65536, 65536, 65536]), "sample points"),
+        ("samples", json!([1, 1, 60000]), "sample points"),
+    ];
+    for (key, value, expected) in cases {
+        let mut network = sound.clone();
+        network[key] = value;
+        fs::write(place.path("large.json"), network.to_string()).unwrap();
+        done(&words(&place.import("weights.pth", "large.json")));
+        let [model, scene, out] = ["out", "scene", "out.npz"].map(|f| place.text(f));
+        let output = bounded(&["inspect", &model, "--operations"]);
+        assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
+        let line = refused(&model, &["rig", &scene, "--model", &model, "-o", &out]);
+        assert!(line.contains(expected), "{line}");
+        let line = refused(&model, &["run", "--model", &model, &scene, "-o", &out]);
+        assert!(line.contains(expected), "{line}");
+    }
+}
