@@ -30,6 +30,13 @@ const GATHER_ROWS: usize = 500;
 /// Voxels that one worker classifies at a time.
 const HEAD_ROWS: usize = 960;
 
+/// Computes rows, a distance apart in the first slice, with scratch in the second.
+type RowKernel<'k> = dyn Fn(Range<usize>, usize, &mut [f32], &mut [f32]) + Sync + 'k;
+/// Computes lines, dense in the first slice, with scratch in the second.
+type LineKernel<'k> = dyn Fn(Range<usize>, &mut [f32], &mut [f32]) + Sync + 'k;
+/// Computes the piece of a number, dense in the first slice, with scratch in the second.
+type PieceKernel<'k> = dyn Fn(usize, &mut [f32], &mut [f32]) + Sync + 'k;
+
 /// Where a head's result goes.
 pub(crate) struct HeadOutput<'a> {
     pub(crate) classes: &'a mut [u8],
@@ -360,14 +367,7 @@ impl Context<'_> {
     }
 
     /// Cuts a convolution's rows into tiles. The output may be some channels of a wider tensor.
-    fn rows(
-        &self,
-        view: View<'_>,
-        operation: &Operation,
-        geometry: &Geometry,
-        camera: usize,
-        kernel: &(dyn Fn(Range<usize>, usize, &mut [f32], &mut [f32]) + Sync),
-    ) {
+    fn rows(&self, view: View<'_>, operation: &Operation, geometry: &Geometry, camera: usize, kernel: &RowKernel<'_>) {
         let stride = self.graph.tensor(operation.output).channels;
         let start = self.range(operation.output, camera).start + operation.first_channel;
         let rows = geometry.rows();
@@ -382,14 +382,7 @@ impl Context<'_> {
     }
 
     /// Gives each worker a few of `lines` equal lines of the output: image rows or volume planes.
-    fn lines(
-        &self,
-        view: View<'_>,
-        operation: &Operation,
-        camera: usize,
-        lines: usize,
-        kernel: &(dyn Fn(Range<usize>, &mut [f32], &mut [f32]) + Sync),
-    ) {
+    fn lines(&self, view: View<'_>, operation: &Operation, camera: usize, lines: usize, kernel: &LineKernel<'_>) {
         let line = self.range(operation.output, camera).len() / lines;
         let per_tile = lines.div_ceil(8 * self.plan.workers()).max(1);
         self.pieces(view, operation, camera, per_tile * line, &|tile, out, scratch| {
@@ -399,14 +392,7 @@ impl Context<'_> {
     }
 
     /// Gives each worker up to `rows` positions of the output at a time.
-    fn chunks(
-        &self,
-        view: View<'_>,
-        operation: &Operation,
-        camera: usize,
-        rows: usize,
-        kernel: &(dyn Fn(Range<usize>, &mut [f32], &mut [f32]) + Sync),
-    ) {
+    fn chunks(&self, view: View<'_>, operation: &Operation, camera: usize, rows: usize, kernel: &LineKernel<'_>) {
         self.pieces(view, operation, camera, rows * operation.channels, &|tile, out, scratch| {
             let first = tile * rows;
             kernel(first..first + out.len() / operation.channels, out, scratch);
@@ -414,14 +400,7 @@ impl Context<'_> {
     }
 
     /// Cuts the output into pieces of `len` numbers.
-    fn pieces(
-        &self,
-        view: View<'_>,
-        operation: &Operation,
-        camera: usize,
-        len: usize,
-        kernel: &(dyn Fn(usize, &mut [f32], &mut [f32]) + Sync),
-    ) {
+    fn pieces(&self, view: View<'_>, operation: &Operation, camera: usize, len: usize, kernel: &PieceKernel<'_>) {
         let Range { start, end } = self.range(operation.output, camera);
         for_each_tile(self.plan.workers(), (end - start).div_ceil(len), &|worker, tile| {
             let place = start + tile * len..end.min(start + (tile + 1) * len);
