@@ -5,6 +5,7 @@
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use std::hint::black_box;
 use std::time::Duration;
+use voxcast::Isa;
 use voxcast::Network;
 use voxcast::rig::{Rig, RigBuilder};
 
@@ -30,7 +31,7 @@ fn entries(rig: &Rig) -> u64 {
 fn rig(c: &mut Criterion) {
     let network = Network::built_in("nuscenes-200").expect("a built-in network");
     let cameras = ring(&network, 6);
-    let mut builder = RigBuilder::new(&network, cameras.len()).expect("a size that can be built");
+    let mut builder = RigBuilder::new(&network, cameras.len(), Isa::best()).expect("a size that can be built");
     let mut rig = builder.build(&cameras).expect("as many matrices as cameras");
     let path = std::env::temp_dir().join(format!("voxcast-bench-{}.safetensors", std::process::id()));
     rig.save(&path, &network).expect("a writable temporary directory");
@@ -39,7 +40,7 @@ fn rig(c: &mut Criterion) {
     group.sample_size(10).warm_up_time(Duration::from_millis(300)).measurement_time(Duration::from_secs(1));
     group.throughput(Throughput::Elements(entries(&rig)));
     group.bench_function("build/nuscenes-200", |b| {
-        b.iter(|| RigBuilder::new(&network, cameras.len()).and_then(|mut b| b.build(black_box(&cameras))));
+        b.iter(|| RigBuilder::new(&network, cameras.len(), Isa::best()).and_then(|mut b| b.build(black_box(&cameras))));
     });
     group.bench_function("rebuild/nuscenes-200", |b| b.iter(|| builder.rebuild(black_box(&cameras), &mut rig)));
     group.bench_function("open/nuscenes-200", |b| b.iter(|| Rig::open(black_box(&path), &network, cameras.len())));

@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 use voxcast::rig::RigBuilder;
-use voxcast::{Model, Scene, Session, SessionOptions, Threads};
+use voxcast::{Isa, Model, Scene, Session, SessionOptions, Threads};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let paths: Vec<PathBuf> = std::env::args_os().skip(1).map(PathBuf::from).collect();
@@ -13,7 +13,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let scene = Scene::open(scene)?;
 
     // Once: the six matrices, and all memory that frames need.
-    let rig = RigBuilder::new(model.network(), scene.cameras())?.build(&scene.lidar2img)?;
+    let rig = RigBuilder::new(model.network(), scene.cameras(), Isa::best())?.build(&scene.lidar2img)?;
     let options = SessionOptions { threads: Threads::new(2)?, ..SessionOptions::default() };
     let mut session = Session::new(model, Arc::new(rig), &options)?;
 

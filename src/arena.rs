@@ -95,7 +95,8 @@ mod tests {
         assert_eq!(numbers.as_ptr() as usize % 64, 0);
         assert!(numbers.iter().all(|&v| v == 0.0));
         // SAFETY: the call panics before it makes a reference.
-        assert!(std::panic::catch_unwind(move || unsafe { view.read(0..113).len() }).is_err());
+        let outside = std::panic::AssertUnwindSafe(|| unsafe { view.read(0..113).len() });
+        assert!(std::panic::catch_unwind(outside).is_err());
     }
 
     #[test]

@@ -5,7 +5,7 @@ use crate::error::{Error, ErrorKind, Result};
 use crate::graph::{Graph, Matrix, Op, Operation, Scope, TensorId};
 use crate::plan::Plan;
 use crate::rig::{Csr, Level};
-use crate::threads::for_each_tile;
+use crate::threads::Threads;
 use std::ops::Range;
 use voxcast_kernels::conv::{Conv, Geometry, conv};
 use voxcast_kernels::deconv3d::{Deconv3d, deconv3d};
@@ -23,19 +23,21 @@ use voxcast_kernels::upsample_add::{UpsampleAdd, upsample_add};
 use voxcast_kernels::window_attention::{WindowAttention, window_attention};
 use voxcast_kernels::{Isa, Panels};
 
-/// Rows of a convolution that one worker takes at a time: one block of the product kernel.
+/// Most rows of a convolution that one worker takes at a time: one block of the product kernel.
 const CONV_ROWS: usize = 96;
+/// Rows that the product kernel computes at once.
+const CONV_TILE: usize = 6;
 /// Voxels or cells that one worker gathers at a time.
 const GATHER_ROWS: usize = 500;
 /// Voxels that one worker classifies at a time.
 const HEAD_ROWS: usize = 960;
 
-/// Computes rows, a distance apart in the first slice, with scratch in the second.
-type RowKernel<'k> = dyn Fn(Range<usize>, usize, &mut [f32], &mut [f32]) + Sync + 'k;
-/// Computes lines, dense in the first slice, with scratch in the second.
-type LineKernel<'k> = dyn Fn(Range<usize>, &mut [f32], &mut [f32]) + Sync + 'k;
-/// Computes the piece of a number, dense in the first slice, with scratch in the second.
-type PieceKernel<'k> = dyn Fn(usize, &mut [f32], &mut [f32]) + Sync + 'k;
+/// Computes rows, `stride` apart, with scratch.
+type RowsKernel<'a> = dyn Fn(Range<usize>, usize, &mut [f32], &mut [f32]) + Sync + 'a;
+/// Computes dense lines, with scratch.
+type LinesKernel<'a> = dyn Fn(Range<usize>, &mut [f32], &mut [f32]) + Sync + 'a;
+/// Computes the piece of an index, with scratch.
+type PieceKernel<'a> = dyn Fn(usize, &mut [f32], &mut [f32]) + Sync + 'a;
 
 /// Where a head's result goes.
 pub(crate) struct HeadOutput<'a> {
@@ -49,6 +51,7 @@ pub(crate) struct Context<'a> {
     pub(crate) graph: &'a Graph,
     pub(crate) plan: &'a Plan,
     pub(crate) cameras: usize,
+    pub(crate) threads: &'a Threads,
 }
 
 /// One camera's image as the caller holds it: `height * width * 3` bytes, blue first.
@@ -326,7 +329,7 @@ impl Context<'_> {
         let rows = classes.len();
         let classes = Shared::new(classes);
         let logits = logits.map(Shared::new);
-        for_each_tile(self.plan.workers(), rows.div_ceil(HEAD_ROWS), &|worker, tile| {
+        self.threads.for_each_tile(self.plan.workers(), rows.div_ceil(HEAD_ROWS), &|worker, tile| {
             let rows = tile * HEAD_ROWS..rows.min((tile + 1) * HEAD_ROWS);
             // SAFETY: each tile has its own rows, and each worker its own scratch.
             let (classes, logits, scratch) = unsafe {
@@ -367,12 +370,15 @@ impl Context<'_> {
     }
 
     /// Cuts a convolution's rows into tiles. The output may be some channels of a wider tensor.
-    fn rows(&self, view: View<'_>, operation: &Operation, geometry: &Geometry, camera: usize, kernel: &RowKernel<'_>) {
+    fn rows(&self, view: View<'_>, operation: &Operation, geometry: &Geometry, camera: usize, kernel: &RowsKernel<'_>) {
         let stride = self.graph.tensor(operation.output).channels;
         let start = self.range(operation.output, camera).start + operation.first_channel;
         let rows = geometry.rows();
-        for_each_tile(self.plan.workers(), rows.div_ceil(CONV_ROWS), &|worker, tile| {
-            let rows = tile * CONV_ROWS..rows.min((tile + 1) * CONV_ROWS);
+        // As many tiles as blocks of rows, but the same number for every worker.
+        let tiles = rows.div_ceil(CONV_ROWS).next_multiple_of(self.plan.workers());
+        let per_tile = rows.div_ceil(tiles).next_multiple_of(CONV_TILE);
+        self.threads.for_each_tile(self.plan.workers(), rows.div_ceil(per_tile), &|worker, tile| {
+            let rows = tile * per_tile..rows.min((tile + 1) * per_tile);
             let place = start + rows.start * stride..start + (rows.end - 1) * stride + operation.channels;
             // SAFETY: each tile has its own rows, and each worker its own scratch; `check` found both apart from
             // everything that is read.
@@ -382,7 +388,7 @@ impl Context<'_> {
     }
 
     /// Gives each worker a few of `lines` equal lines of the output: image rows or volume planes.
-    fn lines(&self, view: View<'_>, operation: &Operation, camera: usize, lines: usize, kernel: &LineKernel<'_>) {
+    fn lines(&self, view: View<'_>, operation: &Operation, camera: usize, lines: usize, kernel: &LinesKernel<'_>) {
         let line = self.range(operation.output, camera).len() / lines;
         let per_tile = lines.div_ceil(8 * self.plan.workers()).max(1);
         self.pieces(view, operation, camera, per_tile * line, &|tile, out, scratch| {
@@ -392,7 +398,7 @@ impl Context<'_> {
     }
 
     /// Gives each worker up to `rows` positions of the output at a time.
-    fn chunks(&self, view: View<'_>, operation: &Operation, camera: usize, rows: usize, kernel: &LineKernel<'_>) {
+    fn chunks(&self, view: View<'_>, operation: &Operation, camera: usize, rows: usize, kernel: &LinesKernel<'_>) {
         self.pieces(view, operation, camera, rows * operation.channels, &|tile, out, scratch| {
             let first = tile * rows;
             kernel(first..first + out.len() / operation.channels, out, scratch);
@@ -402,7 +408,7 @@ impl Context<'_> {
     /// Cuts the output into pieces of `len` numbers.
     fn pieces(&self, view: View<'_>, operation: &Operation, camera: usize, len: usize, kernel: &PieceKernel<'_>) {
         let Range { start, end } = self.range(operation.output, camera);
-        for_each_tile(self.plan.workers(), (end - start).div_ceil(len), &|worker, tile| {
+        self.threads.for_each_tile(self.plan.workers(), (end - start).div_ceil(len), &|worker, tile| {
             let place = start + tile * len..end.min(start + (tile + 1) * len);
             // SAFETY: each tile has its own piece, and each worker its own scratch; `check` found both apart from
             // everything that is read.

@@ -20,14 +20,14 @@
 //! use std::path::Path;
 //! use std::sync::Arc;
 //! use voxcast::rig::RigBuilder;
-//! use voxcast::{ImageView, Model, Session, SessionOptions, Threads};
+//! use voxcast::{ImageView, Isa, Model, Session, SessionOptions, Threads};
 //!
 //! # fn main() -> voxcast::Result<()> {
 //! # let calibrations: Vec<[f32; 16]> = vec![];
 //! # let cameras: Vec<Vec<u8>> = vec![];
 //! // Once. A rig of fixed cameras can be saved and mapped instead: `Rig::save`, `Rig::open`.
 //! let model = Arc::new(Model::open(Path::new("model.safetensors"))?);
-//! let mut builder = RigBuilder::new(model.network(), calibrations.len())?;
+//! let mut builder = RigBuilder::new(model.network(), calibrations.len(), Isa::best())?;
 //! let rig = Arc::new(builder.build(&calibrations)?);
 //! let options = SessionOptions { threads: Threads::new(2)?, logits: true, ..SessionOptions::default() };
 //! println!("{} bytes", Session::memory(&model, rig.cameras(), &options)?.total());

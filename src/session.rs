@@ -226,7 +226,7 @@ impl Session {
     ) -> Result<Occupancy<'_>> {
         self.check_images(images)?;
         let threads = self.threads.clone();
-        threads.install(|| self.frame(images, observer));
+        threads.enter(|| self.frame(images, observer));
         let logits = self.keep_logits.then_some(&self.logits[..]);
         Ok(Occupancy { grid: self.model.network().output_grid(), classes: &self.classes, logits })
     }
@@ -253,7 +253,7 @@ impl Session {
     }
 
     fn context(&self) -> Context<'_> {
-        Context { isa: self.isa, graph: &self.graph, plan: &self.plan, cameras: self.cameras }
+        Context { isa: self.isa, graph: &self.graph, plan: &self.plan, cameras: self.cameras, threads: &self.threads }
     }
 
     fn frame(&mut self, images: &[ImageView<'_>], observer: &mut dyn FnMut(Event<'_>)) {
@@ -278,7 +278,13 @@ impl Session {
         observer: &mut dyn FnMut(Event<'_>),
     ) {
         let start = Instant::now();
-        let context = Context { isa: self.isa, graph: &self.graph, plan: &self.plan, cameras: self.cameras };
+        let context = Context {
+            isa: self.isa,
+            graph: &self.graph,
+            plan: &self.plan,
+            cameras: self.cameras,
+            threads: &self.threads,
+        };
         let operation = &self.graph.operations[index];
         let levels = [0, 1, 2].map(|i| self.rig.level(i));
         let mut parts = [Panels::F32(&[]); crate::weights::MAX_PARTS];

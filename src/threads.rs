@@ -1,13 +1,27 @@
-//! Who computes: the calling thread, or a pool. Work is cut into tiles that any worker may take.
+//! Who computes: the calling thread, a crew of its own, or a rayon pool. Work is cut into tiles that any worker may take.
+//!
+//! A session's frames must not allocate. Rayon allocates now and then when a thread outside its pool hands it work, so
+//! [`Threads::new`] makes plain threads that wait for one thing only; [`Threads::pool`] shares a pool where its owner
+//! prefers that.
 
 use rayon::ThreadPool;
+use std::any::Any;
 use std::fmt;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::thread::JoinHandle;
 
 /// The threads of a session. Their number cannot change a result.
 #[derive(Clone)]
-pub struct Threads(Option<Arc<ThreadPool>>);
+pub struct Threads(Kind);
+
+#[derive(Clone)]
+enum Kind {
+    Calling,
+    Crew(Arc<Crew>),
+    Pool(Arc<ThreadPool>),
+}
 
 impl fmt::Debug for Threads {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -18,64 +32,104 @@ impl fmt::Debug for Threads {
 impl Threads {
     /// Only the thread that calls.
     pub fn calling() -> Self {
-        Self(None)
+        Self(Kind::Calling)
     }
 
-    /// An existing pool, shared with whoever else uses it.
+    /// An existing pool, shared with whoever else uses it. Handing a frame to it from outside allocates a little, once in
+    /// some sixty frames.
     pub fn pool(pool: Arc<ThreadPool>) -> Self {
-        Self(Some(pool))
+        Self(Kind::Pool(pool))
     }
 
-    /// A pool of its own with `count` threads; the calling thread alone for 0 or 1.
+    /// The calling thread and `count` - 1 of their own; the calling thread alone for 0 or 1. They end with the last clone.
+    ///
+    /// Sessions may share them. Where two run at once, one has the threads for an operation and the other does with its own.
     ///
     /// # Errors
-    /// The system's, if threads cannot be started.
+    /// [`ErrorKind::Unsupported`](crate::ErrorKind::Unsupported) with the system's, if threads cannot be started.
     pub fn new(count: usize) -> crate::Result<Self> {
         if count <= 1 {
             return Ok(Self::calling());
         }
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(count).build().map_err(|e| {
+        let crew = Crew::new(count).map_err(|e| {
             crate::Error::new(crate::ErrorKind::Unsupported, format!("cannot start {count} threads: {e}"))
         })?;
-        Ok(Self(Some(Arc::new(pool))))
+        Ok(Self(Kind::Crew(Arc::new(crew))))
     }
 
     /// Threads that compute.
     pub fn count(&self) -> usize {
-        self.0.as_ref().map_or(1, |pool| pool.current_num_threads())
+        match &self.0 {
+            Kind::Calling => 1,
+            Kind::Crew(crew) => crew.count(),
+            Kind::Pool(pool) => pool.current_num_threads(),
+        }
     }
 
     /// Runs `f` on every thread at once.
     pub fn broadcast<R: Send>(&self, f: impl Fn() -> R + Sync) -> Vec<R> {
         match &self.0 {
-            Some(pool) => pool.broadcast(|_| f()),
-            None => vec![f()],
+            Kind::Calling => vec![f()],
+            Kind::Crew(crew) => {
+                let results: Vec<Mutex<Option<R>>> = (0..crew.count()).map(|_| Mutex::new(None)).collect();
+                let turn = crew.turn.lock().unwrap_or_else(PoisonError::into_inner);
+                crew.run(turn, crew.count(), &|worker| *lock(&results[worker]) = Some(f()));
+                results.into_iter().filter_map(|r| r.into_inner().unwrap_or_else(PoisonError::into_inner)).collect()
+            }
+            Kind::Pool(pool) => pool.broadcast(|_| f()),
         }
     }
 
-    /// Runs `f` on these threads: what it does in parallel with rayon stays among them.
+    /// Runs `f` such that what it does in parallel with rayon uses this many threads: those of the pool, or as many of
+    /// their own, started when first asked for. Where the system refuses to start them, rayon's global pool serves.
     pub fn install<R: Send>(&self, f: impl FnOnce() -> R + Send) -> R {
         match &self.0 {
-            Some(pool) => pool.install(f),
-            None => f(),
+            Kind::Calling => f(),
+            Kind::Crew(crew) => match crew.rayon() {
+                Some(pool) => pool.install(f),
+                None => f(),
+            },
+            Kind::Pool(pool) => pool.install(f),
         }
     }
-}
 
-/// Calls `tile(worker, index)` once for every index below `tiles`, on up to `workers` threads of the current pool. At any
-/// moment each worker number is in use by one call at most. Allocates nothing.
-pub(crate) fn for_each_tile(workers: usize, tiles: usize, tile: &(dyn Fn(usize, usize) + Sync)) {
-    let next = AtomicUsize::new(0);
-    let work = |worker: usize| {
-        loop {
-            let index = next.fetch_add(1, Ordering::Relaxed);
-            if index >= tiles {
-                return;
-            }
-            tile(worker, index);
+    /// Runs `f`, which calls [`Threads::for_each_tile`], where that is cheapest.
+    pub(crate) fn enter<R: Send>(&self, f: impl FnOnce() -> R + Send) -> R {
+        match &self.0 {
+            Kind::Pool(pool) => pool.install(f),
+            Kind::Calling | Kind::Crew(_) => f(),
         }
-    };
-    fork(0, workers.min(tiles), &work);
+    }
+
+    /// Calls `tile(worker, index)` once for every index below `tiles`, on up to `workers` threads. At any moment each
+    /// worker number is in use by one call at most. Allocates nothing.
+    ///
+    /// # Panics
+    /// If a tile does, once no other is running.
+    pub(crate) fn for_each_tile(&self, workers: usize, tiles: usize, tile: &(dyn Fn(usize, usize) + Sync)) {
+        let next = AtomicUsize::new(0);
+        let work = |worker: usize| {
+            loop {
+                let index = next.fetch_add(1, Ordering::Relaxed);
+                if index >= tiles {
+                    return;
+                }
+                tile(worker, index);
+            }
+        };
+        let workers = workers.min(tiles).min(self.count());
+        match &self.0 {
+            _ if workers <= 1 => work(0),
+            Kind::Calling => work(0),
+            // Another session's operation is under way: waiting for it would take longer than going alone.
+            Kind::Crew(crew) => match crew.turn.try_lock() {
+                Ok(turn) => crew.run(turn, workers, &work),
+                Err(std::sync::TryLockError::Poisoned(turn)) => crew.run(turn.into_inner(), workers, &work),
+                Err(std::sync::TryLockError::WouldBlock) => work(0),
+            },
+            Kind::Pool(_) => fork(0, workers, &work),
+        }
+    }
 }
 
 /// Runs `work` for each worker number in `first..end`, as far as possible at once.
@@ -90,26 +144,277 @@ fn fork(first: usize, end: usize, work: &(dyn Fn(usize) + Sync)) {
     }
 }
 
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// How often a thread looks for news before it sleeps: some ten microseconds, the time that waking takes.
+const SPINS: usize = 400;
+
+/// Threads that wait for work and do it together with the thread that brings it.
+struct Crew {
+    shared: Arc<Shared>,
+    /// Held by the one that brings work.
+    turn: Mutex<()>,
+    threads: Vec<JoinHandle<()>>,
+    rayon: OnceLock<Option<ThreadPool>>,
+}
+
+#[derive(Default)]
+struct Shared {
+    job: Mutex<Job>,
+    /// A round began, or the crew ends.
+    start: Condvar,
+    /// Nobody is left working.
+    done: Condvar,
+    /// Copies of the job's `round` and `left`, to look at without the lock. Only the job decides.
+    round: AtomicU64,
+    left: AtomicUsize,
+}
+
+#[derive(Default)]
+struct Job {
+    /// Counts pieces of work.
+    round: u64,
+    work: Option<Work>,
+    /// Worker numbers from 1 to below this take part.
+    workers: usize,
+    /// Threads that have not finished this round.
+    left: usize,
+    /// What the first of them to panic said.
+    panic: Option<Box<dyn Any + Send>>,
+    end: bool,
+}
+
+/// The closure of a round, without its type and lifetime.
+#[derive(Clone, Copy)]
+struct Work {
+    closure: *const (),
+    call: unsafe fn(*const (), usize),
+}
+
+// SAFETY: `Work::new` takes only closures that are `Sync`.
+unsafe impl Send for Work {}
+
+impl Work {
+    fn new<W: Fn(usize) + Sync>(work: &W) -> Self {
+        /// # Safety
+        /// `closure` points to a living `W`.
+        unsafe fn call<W: Fn(usize)>(closure: *const (), worker: usize) {
+            // SAFETY: as the caller promises.
+            unsafe { (*closure.cast::<W>())(worker) }
+        }
+        Self { closure: std::ptr::from_ref(work).cast(), call: call::<W> }
+    }
+}
+
+impl Crew {
+    fn new(count: usize) -> std::io::Result<Self> {
+        let shared = Arc::new(Shared::default());
+        // Dropping a crew ends and joins those that were started, also when a later one cannot be.
+        let mut crew = Self { shared, turn: Mutex::new(()), threads: vec![], rayon: OnceLock::new() };
+        for worker in 1..count {
+            let shared = crew.shared.clone();
+            let builder = std::thread::Builder::new().name(format!("voxcast {worker}"));
+            crew.threads.push(builder.spawn(move || shared.serve(worker))?);
+        }
+        Ok(crew)
+    }
+
+    fn count(&self) -> usize {
+        self.threads.len() + 1
+    }
+
+    fn rayon(&self) -> Option<&ThreadPool> {
+        let build = || rayon::ThreadPoolBuilder::new().num_threads(self.count()).build().ok();
+        self.rayon.get_or_init(build).as_ref()
+    }
+
+    /// Runs `work(0)` here and `work(1)` to `work(workers - 1)` on the crew, and returns when all of them have.
+    fn run<W: Fn(usize) + Sync>(&self, turn: MutexGuard<'_, ()>, workers: usize, work: &W) {
+        let shared = &*self.shared;
+        {
+            let mut job = lock(&shared.job);
+            job.round += 1;
+            job.work = Some(Work::new(work));
+            job.workers = workers.min(self.count());
+            job.left = job.workers - 1;
+            shared.left.store(job.left, Ordering::Release);
+            shared.round.store(job.round, Ordering::Release);
+        }
+        shared.start.notify_all();
+        // Also after a panic here, others still use `work`.
+        let own = catch_unwind(AssertUnwindSafe(|| work(0)));
+        for _ in 0..SPINS {
+            if shared.left.load(Ordering::Acquire) == 0 {
+                break;
+            }
+            std::hint::spin_loop();
+        }
+        let mut job = lock(&shared.job);
+        while job.left > 0 {
+            job = shared.done.wait(job).unwrap_or_else(PoisonError::into_inner);
+        }
+        job.work = None;
+        let theirs = job.panic.take();
+        drop(job);
+        drop(turn);
+        if let Some(panic) = own.err().or(theirs) {
+            resume_unwind(panic);
+        }
+    }
+}
+
+impl Drop for Crew {
+    fn drop(&mut self) {
+        lock(&self.shared.job).end = true;
+        self.shared.start.notify_all();
+        for thread in self.threads.drain(..) {
+            // A worker catches every panic of the work, so there is none to pass on.
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Shared {
+    /// The life of thread `worker`.
+    fn serve(&self, worker: usize) {
+        let mut seen = 0;
+        loop {
+            for _ in 0..SPINS {
+                if self.round.load(Ordering::Acquire) != seen {
+                    break;
+                }
+                std::hint::spin_loop();
+            }
+            let mut job = lock(&self.job);
+            while job.round == seen && !job.end {
+                job = self.start.wait(job).unwrap_or_else(PoisonError::into_inner);
+            }
+            if job.end {
+                return;
+            }
+            seen = job.round;
+            if worker >= job.workers {
+                continue;
+            }
+            let Some(Work { closure, call }) = job.work else { continue };
+            drop(job);
+            // SAFETY: this thread is one of those that the round's `left` counts, and `Crew::run`, which borrows the
+            // closure that the work was made of, does not end before `left` is 0.
+            let result = catch_unwind(AssertUnwindSafe(|| unsafe { call(closure, worker) }));
+            let mut job = lock(&self.job);
+            job.left -= 1;
+            self.left.store(job.left, Ordering::Release);
+            if let Err(panic) = result {
+                job.panic.get_or_insert(panic);
+            }
+            if job.left == 0 {
+                self.done.notify_one();
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use std::sync::atomic::AtomicU32;
 
+    /// Every kind of threads with `count` of them.
+    fn kinds(count: usize) -> Vec<Threads> {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(count).build().expect("threads");
+        vec![Threads::new(count).expect("threads"), Threads::pool(Arc::new(pool))]
+    }
+
     #[test]
     fn every_tile_once_and_no_worker_twice_at_once() {
-        for count in [1, 2, 3, 8] {
-            let threads = Threads::new(count).expect("threads");
-            assert_eq!(threads.count(), count);
-            let seen: Vec<AtomicU32> = (0..1000).map(|_| AtomicU32::new(0)).collect();
-            let busy: Vec<AtomicU32> = (0..count).map(|_| AtomicU32::new(0)).collect();
-            threads.install(|| {
-                for_each_tile(count, seen.len(), &|worker, index| {
-                    assert_eq!(busy[worker].fetch_add(1, Ordering::SeqCst), 0);
-                    seen[index].fetch_add(1, Ordering::SeqCst);
-                    busy[worker].fetch_sub(1, Ordering::SeqCst);
+        for threads in [1, 2, 3, 8].into_iter().flat_map(kinds) {
+            let count = threads.count();
+            for (workers, tiles) in [(count, 1000), (count, 0), (count, 1), (count, 2), (1, 50), (2, 50)] {
+                let seen: Vec<AtomicU32> = (0..tiles).map(|_| AtomicU32::new(0)).collect();
+                let busy: Vec<AtomicU32> = (0..workers).map(|_| AtomicU32::new(0)).collect();
+                threads.enter(|| {
+                    threads.for_each_tile(workers, tiles, &|worker, index| {
+                        assert_eq!(busy[worker].fetch_add(1, Ordering::SeqCst), 0);
+                        seen[index].fetch_add(1, Ordering::SeqCst);
+                        busy[worker].fetch_sub(1, Ordering::SeqCst);
+                    });
+                });
+                assert!(seen.iter().all(|n| n.load(Ordering::SeqCst) == 1), "{workers} workers, {tiles} tiles");
+            }
+        }
+    }
+
+    #[test]
+    fn many_short_rounds_from_many_sides() {
+        let threads = Threads::new(3).expect("threads");
+        std::thread::scope(|scope| {
+            for _ in 0..3 {
+                scope.spawn(|| {
+                    for round in 0..3000 {
+                        let sum = AtomicUsize::new(0);
+                        threads.for_each_tile(3, round % 7, &|_, index| {
+                            sum.fetch_add(index + 1, Ordering::Relaxed);
+                        });
+                        let tiles = round % 7;
+                        assert_eq!(sum.load(Ordering::Relaxed), tiles * (tiles + 1) / 2);
+                    }
+                });
+            }
+        });
+    }
+
+    #[test]
+    fn broadcasts_reach_every_thread() {
+        for threads in [1, 2, 5].into_iter().flat_map(kinds) {
+            let mut ids = threads.broadcast(|| std::thread::current().id());
+            assert_eq!(ids.len(), threads.count());
+            ids.sort_by_key(|id| format!("{id:?}"));
+            ids.dedup();
+            assert_eq!(ids.len(), threads.count(), "different threads");
+        }
+    }
+
+    #[test]
+    fn rayon_finds_as_many_threads() {
+        for threads in [2, 3].into_iter().flat_map(kinds) {
+            assert_eq!(threads.install(rayon::current_num_threads), threads.count());
+        }
+        assert_eq!(Threads::calling().install(|| 7), 7);
+    }
+
+    #[test]
+    fn a_panic_arrives_and_harms_nobody() {
+        for threads in kinds(3) {
+            for bad in [0, 1, 499] {
+                let result = catch_unwind(AssertUnwindSafe(|| {
+                    threads.enter(|| threads.for_each_tile(3, 500, &|_, index| assert_ne!(index, bad, "tile {bad}")));
+                }));
+                let panic = result.expect_err("a tile panicked");
+                let text = panic.downcast_ref::<String>().expect("a message");
+                assert!(text.contains(&format!("tile {bad}")), "{text}");
+            }
+            let sum = AtomicUsize::new(0);
+            threads.enter(|| {
+                threads.for_each_tile(3, 100, &|_, index| {
+                    sum.fetch_add(index, Ordering::Relaxed);
                 });
             });
-            assert!(seen.iter().all(|n| n.load(Ordering::SeqCst) == 1));
+            assert_eq!(sum.into_inner(), 4950);
         }
+    }
+
+    #[test]
+    fn none_and_one_are_the_caller() {
+        for count in [0, 1] {
+            let threads = Threads::new(count).expect("nothing to start");
+            assert_eq!(threads.count(), 1);
+            let here = std::thread::current().id();
+            threads.for_each_tile(4, 10, &|worker, _| {
+                assert_eq!((worker, std::thread::current().id()), (0, here));
+            });
+        }
+        assert_eq!(format!("{:?}", Threads::new(2).expect("threads")), "Threads(2)");
     }
 }

@@ -15,6 +15,8 @@
 //! The AVX2 body computes eight z at once, the terms of x and y once per line, and ends lines that are no multiple of
 //! eight with the specification.
 
+use crate::isa::Isa;
+
 /// Rounding of the products: in which order, and with which roundings, a row is multiplied with a point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Sum {
@@ -87,7 +89,7 @@ impl Projection {
 ///
 /// # Panics
 /// If `out` does not hold one element per point, or `p` breaks a rule of its fields.
-pub fn project_points_reference(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
+fn reference(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
     p.check([xs.len(), ys.len(), zs.len()], out);
     let mut any = 0;
     let mut at = 0;
@@ -103,8 +105,24 @@ pub fn project_points_reference(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f3
     any != 0
 }
 
-#[cfg(target_arch = "x86_64")]
-pub use avx2::project_points_avx2;
+/// Projects the points (xs\[i\], ys\[j\], zs\[k\]) as the module says: `out[(i * ys.len() + j) * zs.len() + k]` becomes the
+/// flat pixel that the point hits, or 0 where it hits none. Returns whether any point hits one.
+///
+/// # Panics
+/// If `out` does not hold one element per point, or `p` breaks a rule of its fields.
+///
+/// # Determinism
+/// The same on every instruction set.
+pub fn project_points(isa: Isa, p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
+    match isa {
+        #[cfg(target_arch = "x86_64")]
+        Isa::Avx2(_) => {
+            // SAFETY: the token in `isa` proves that this CPU has AVX2 and FMA.
+            unsafe { avx2::project_points(p, xs, ys, zs, out) }
+        }
+        _ => reference(p, xs, ys, zs, out),
+    }
+}
 
 #[cfg(target_arch = "x86_64")]
 mod avx2 {
@@ -120,7 +138,7 @@ mod avx2 {
         shift: __m128i,
     }
 
-    /// [`project_points_reference`](super::project_points_reference), eight points at a time and equal to it in every
+    /// the specification, eight points at a time and equal to it in every
     /// bit.
     ///
     /// # Panics
@@ -129,7 +147,7 @@ mod avx2 {
     /// # Safety
     /// The CPU must have AVX2 and FMA.
     #[target_feature(enable = "avx2,fma")]
-    pub fn project_points_avx2(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
+    pub(super) fn project_points(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
         p.check([xs.len(), ys.len(), zs.len()], out);
         match p.sum {
             Sum::Chain => lines::<false>(p, xs, ys, zs, out),
@@ -235,7 +253,7 @@ mod tests {
 
     fn one(p: &Projection, [x, y, z]: [f32; 3]) -> u32 {
         let mut out = [7];
-        let any = project_points_reference(p, &[x], &[y], &[z], &mut out);
+        let any = reference(p, &[x], &[y], &[z], &mut out);
         assert_eq!(any, out[0] != 0);
         out[0]
     }
@@ -286,21 +304,21 @@ mod tests {
     #[test]
     #[should_panic(expected = "one pixel per sample point")]
     fn short_output_is_refused() {
-        project_points_reference(&pinhole(), &[0.0], &[0.0], &[1.0, 2.0], &mut [0]);
+        reference(&pinhole(), &[0.0], &[0.0], &[1.0, 2.0], &mut [0]);
     }
 
     #[test]
     #[should_panic(expected = "flat pixels fit 32 bits")]
     fn overflowing_base_is_refused() {
         let p = Projection { base: u32::MAX - 30, ..pinhole() };
-        project_points_reference(&p, &[0.0], &[0.0], &[1.0], &mut [0]);
+        reference(&p, &[0.0], &[0.0], &[1.0], &mut [0]);
     }
 
     #[test]
     #[should_panic(expected = "a multiple of the stride")]
     fn ragged_image_is_refused() {
         let p = Projection { width: 60, ..pinhole() };
-        project_points_reference(&p, &[0.0], &[0.0], &[1.0], &mut [0]);
+        reference(&p, &[0.0], &[0.0], &[1.0], &mut [0]);
     }
 
     fn number() -> impl Strategy<Value = f32> {
@@ -343,38 +361,35 @@ mod tests {
             prop_assert!(pixel == 0 || (p.base..last).contains(&pixel));
         }
 
-        #[cfg(target_arch = "x86_64")]
         #[test]
-        fn avx2_is_the_specification(
+        fn every_isa_is_the_specification(
             p in projections(),
             xs in prop::collection::vec(number(), 0..4),
             ys in prop::collection::vec(number(), 0..4),
             zs in prop::collection::vec(number(), 0..35),
         ) {
-            assert!(is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"), "this test needs AVX2 and FMA");
             let mut expected = vec![1; xs.len() * ys.len() * zs.len()];
             let mut found = vec![2; expected.len()];
-            let any = project_points_reference(&p, &xs, &ys, &zs, &mut expected);
-            // SAFETY: the assertion above saw both features.
-            let any_avx2 = unsafe { project_points_avx2(&p, &xs, &ys, &zs, &mut found) };
-            prop_assert_eq!(any, any_avx2);
-            prop_assert_eq!(expected, found);
+            let any = reference(&p, &xs, &ys, &zs, &mut expected);
+            for isa in Isa::available() {
+                prop_assert_eq!(any, project_points(isa, &p, &xs, &ys, &zs, &mut found));
+                prop_assert_eq!(&expected, &found);
+            }
         }
     }
 
-    #[cfg(target_arch = "x86_64")]
     #[test]
-    fn avx2_is_the_specification_where_most_points_hit() {
-        assert!(is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"), "this test needs AVX2 and FMA");
+    fn every_isa_is_the_specification_where_most_points_hit() {
         let axis: Vec<f32> = (0..61).map(|i| -1.0 + i as f32 * 0.07).collect();
         for sum in [Sum::Chain, Sum::Pairs] {
             let p = Projection { sum, ..pinhole() };
             let mut expected = vec![0; axis.len().pow(3)];
             let mut found = expected.clone();
-            project_points_reference(&p, &axis, &axis, &axis, &mut expected);
-            // SAFETY: the assertion above saw both features.
-            unsafe { project_points_avx2(&p, &axis, &axis, &axis, &mut found) };
-            assert_eq!(expected, found);
+            reference(&p, &axis, &axis, &axis, &mut expected);
+            for isa in Isa::available() {
+                project_points(isa, &p, &axis, &axis, &axis, &mut found);
+                assert_eq!(expected, found);
+            }
             let hits = expected.iter().filter(|&&v| v != 0).count();
             assert!(hits * 5 > expected.len(), "{hits} of {} hit", expected.len());
         }

@@ -49,7 +49,7 @@ impl Demo {
         println!("model and scene made in {}", terminal::time(start.elapsed()));
 
         let start = Instant::now();
-        let rig = Arc::new(frame::rig(None, &model, &scene, &options.threads)?);
+        let rig = Arc::new(frame::rig(None, &model, &scene, &options)?);
         println!("six matrices built in {}", terminal::time(start.elapsed()));
         rig.save(&directory.join("rig.safetensors"), model.network())?;
 

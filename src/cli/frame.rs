@@ -4,7 +4,7 @@ use super::Machine;
 use std::path::Path;
 use std::sync::Arc;
 use voxcast::rig::RigBuilder;
-use voxcast::{Error, Model, Result, Rig, Scene, SessionOptions, Threads};
+use voxcast::{Error, Model, Result, Rig, Scene, SessionOptions};
 
 /// Calibration of a scene directory, of its calibration.json alone, or of a scene file.
 pub fn calibration(path: &Path) -> Result<Vec<[f32; 16]>> {
@@ -17,12 +17,12 @@ pub fn calibration(path: &Path) -> Result<Vec<[f32; 16]>> {
 }
 
 /// The rig from its file, or built from the scene's calibration.
-pub fn rig(path: Option<&Path>, model: &Model, scene: &Scene, threads: &Threads) -> Result<Rig> {
+pub fn rig(path: Option<&Path>, model: &Model, scene: &Scene, options: &SessionOptions) -> Result<Rig> {
     match path {
         Some(path) => Rig::open(path, model.network(), scene.cameras()),
         None => {
-            let mut builder = RigBuilder::new(model.network(), scene.cameras())?;
-            threads.install(|| builder.build(&scene.lidar2img))
+            let mut builder = RigBuilder::new(model.network(), scene.cameras(), options.isa)?;
+            options.threads.install(|| builder.build(&scene.lidar2img))
         }
     }
 }

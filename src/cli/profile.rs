@@ -57,7 +57,7 @@ impl Profile {
         let (model, scene) = frame::open(&self.model, &self.scene)?;
         let mut options = frame::options(&self.machine)?;
         options.unfolded = self.unfolded;
-        let rig = Arc::new(frame::rig(self.rig.as_deref(), &model, &scene, &options.threads)?);
+        let rig = Arc::new(frame::rig(self.rig.as_deref(), &model, &scene, &options)?);
         let mut session = Session::new(model, rig, &options)?;
         let graph = session.graph().clone();
         let images = views(&scene);

@@ -1,6 +1,6 @@
 //! `voxcast rig`
 
-use super::{ThreadCount, frame, terminal};
+use super::{Machine, frame, terminal};
 use clap::Args;
 use std::path::PathBuf;
 use std::time::Instant;
@@ -23,15 +23,15 @@ pub struct BuildRig {
     #[arg(short, long, value_name = "RIG")]
     output: PathBuf,
     #[command(flatten)]
-    threads: ThreadCount,
+    machine: Machine,
 }
 
 impl BuildRig {
     pub fn run(self) -> Result<()> {
         let model = Model::open(&self.model)?;
         let lidar2img = frame::calibration(&self.scene)?;
-        let threads = self.threads.threads()?;
-        let mut builder = voxcast::rig::RigBuilder::new(model.network(), lidar2img.len())?;
+        let threads = self.machine.threads()?;
+        let mut builder = voxcast::rig::RigBuilder::new(model.network(), lidar2img.len(), self.machine.isa()?)?;
         let start = Instant::now();
         let rig = threads.install(|| builder.build(&lidar2img))?;
         let elapsed = start.elapsed();

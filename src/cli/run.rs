@@ -71,7 +71,7 @@ impl Run {
         let loaded = start.elapsed();
 
         let start = Instant::now();
-        let rig = Arc::new(frame::rig(self.rig.as_deref(), &model, &scene, &options.threads)?);
+        let rig = Arc::new(frame::rig(self.rig.as_deref(), &model, &scene, &options)?);
         let rig_time = start.elapsed();
         let mut session = Session::new(model.clone(), rig.clone(), &options)?;
 

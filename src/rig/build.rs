@@ -23,7 +23,8 @@ use crate::network::Network;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
-use voxcast_kernels::project::{Projection, project_points_reference};
+use voxcast_kernels::Isa;
+use voxcast_kernels::project::project_points;
 
 /// Rows of one matrix. A gibibyte of row pointers; `nuscenes-256` has 2^18.
 const MAX_ROWS: u128 = 1 << 28;
@@ -52,7 +53,7 @@ pub struct RigBuilder {
     /// One per thread of the pool.
     scratch: Vec<Mutex<Scratch>>,
     cameras: usize,
-    avx2: bool,
+    isa: Isa,
 }
 
 /// What is fixed about a level.
@@ -105,7 +106,7 @@ impl RigBuilder {
     /// [`ErrorKind::Format`] if `network` breaks a rule of [`Network::check`] or `cameras` is 0;
     /// [`ErrorKind::TooLarge`] if flat pixels exceed 32 bits, or a level has more rows or sample points than could be
     /// built in sensible memory and time.
-    pub fn new(network: &Network, cameras: usize) -> Result<Self> {
+    pub fn new(network: &Network, cameras: usize, isa: Isa) -> Result<Self> {
         network.check()?;
         if cameras == 0 {
             return Err(Error::format("0 cameras, expected at least one"));
@@ -125,7 +126,7 @@ impl RigBuilder {
                 bev: Rows::default(),
             }));
         }
-        Ok(Self { levels, slabs, views: Default::default(), scratch: Vec::new(), cameras, avx2: avx2() })
+        Ok(Self { levels, slabs, views: Default::default(), scratch: Vec::new(), cameras, isa })
     }
 
     /// The matrices for `lidar2img`: per camera, row-major 4x4, lidar-frame metres (x, y, z, 1) to (u * d, v * d, d, 1)
@@ -157,12 +158,6 @@ impl RigBuilder {
             }
         }
         Ok(())
-    }
-
-    /// The same builder with the specification's kernel.
-    #[cfg(test)]
-    pub(super) fn without_simd(self) -> Self {
-        Self { avx2: false, ..self }
     }
 
     /// Joins the slabs' rows. Fails, if it does, before it changes a number.
@@ -207,12 +202,12 @@ impl RigBuilder {
             views.extend(lidar2img.iter().enumerate().map(|(c, m)| View::new(level, self.cameras, c, m)));
         }
         let entries: [[AtomicU64; 2]; 3] = Default::default();
-        let (levels, views, scratch, avx2) = (&self.levels, &self.views, &self.scratch, self.avx2);
+        let (levels, views, scratch, isa) = (&self.levels, &self.views, &self.scratch, self.isa);
         self.slabs.par_iter_mut().with_max_len(1).try_for_each(|slab| {
             // Slabs start no parallel work of their own, so a thread never meets its own lock.
             let thread = rayon::current_thread_index().unwrap_or(0) % scratch.len();
             let mut scratch = scratch[thread].lock().unwrap_or_else(PoisonError::into_inner);
-            slab.fill(&levels[slab.level], &views[slab.level], &mut scratch, avx2)?;
+            slab.fill(&levels[slab.level], &views[slab.level], &mut scratch, isa)?;
             for (total, rows) in entries[slab.level].iter().zip([&slab.volume, &slab.bev]) {
                 let more = rows.col.len() as u64;
                 if total.fetch_add(more, Ordering::Relaxed) + more > u64::from(u32::MAX) {
@@ -228,25 +223,6 @@ impl std::fmt::Debug for RigBuilder {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("RigBuilder").field("cameras", &self.cameras).field("slabs", &self.slabs.len()).finish()
     }
-}
-
-/// Whether the vector body can run.
-fn avx2() -> bool {
-    #[cfg(target_arch = "x86_64")]
-    return is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
-    #[cfg(not(target_arch = "x86_64"))]
-    false
-}
-
-/// The kernel that `avx2`, the value of [`avx2()`] or false, selects.
-fn project(avx2: bool, p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
-    #[cfg(target_arch = "x86_64")]
-    if avx2 {
-        // SAFETY: `avx2()` detected both features.
-        return unsafe { voxcast_kernels::project::project_points_avx2(p, xs, ys, zs, out) };
-    }
-    let _ = avx2;
-    project_points_reference(p, xs, ys, zs, out)
 }
 
 /// Refuses levels that nobody could build. `network` is checked, so 128 bits hold every product.
@@ -300,7 +276,7 @@ fn range(values: &[f32]) -> [f64; 2] {
 }
 
 impl Slab {
-    fn fill(&mut self, level: &Level, views: &[View], scratch: &mut Scratch, avx2: bool) -> Result<()> {
+    fn fill(&mut self, level: &Level, views: &[View], scratch: &mut Scratch, isa: Isa) -> Result<()> {
         let [_, grid_y, grid_z] = level.grid;
         let n = level.samples;
         let (points, line) = (level.points(), level.axes[2].len());
@@ -314,7 +290,7 @@ impl Slab {
             let mut seen = 0;
             for view in views.iter().filter(|v| v.may_see(&bounds)) {
                 let out = &mut hits[seen * points..][..points];
-                seen += usize::from(project(avx2, &view.projection, xs, ys, &level.axes[2], out));
+                seen += usize::from(project_points(isa, &view.projection, xs, ys, &level.axes[2], out));
             }
             let hits = &hits[..seen * points];
             volume_rows.reserve(grid_z * (n * n * n).min(level.pixels) * seen)?;

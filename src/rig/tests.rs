@@ -8,6 +8,7 @@ use proptest::prelude::*;
 use safetensors::Dtype;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
+use voxcast_kernels::Isa;
 
 type Matrix = [f32; 16];
 
@@ -90,7 +91,7 @@ fn assert_naive(network: &Network, cameras: &[Matrix], rig: &Rig) {
 }
 
 fn build(network: &Network, cameras: &[Matrix]) -> Rig {
-    RigBuilder::new(network, cameras.len()).unwrap().build(cameras).unwrap()
+    RigBuilder::new(network, cameras.len(), Isa::best()).unwrap().build(cameras).unwrap()
 }
 
 /// u = 8 x, v = 8 y, wherever z is.
@@ -169,7 +170,7 @@ proptest! {
         let cameras = ring(cameras, network.image, turn);
         let rig = build(&network, &cameras);
         assert_naive(&network, &cameras, &rig);
-        let mut scalar = RigBuilder::new(&network, cameras.len()).unwrap().without_simd();
+        let mut scalar = RigBuilder::new(&network, cameras.len(), Isa::Scalar).unwrap();
         prop_assert!(scalar.build(&cameras).unwrap() == rig);
     }
 
@@ -183,7 +184,7 @@ proptest! {
 
     #[test]
     fn rebuilding_is_building(network in networks(), turns in prop::collection::vec(0.0f32..6.3, 2..4)) {
-        let mut builder = RigBuilder::new(&network, 3).unwrap();
+        let mut builder = RigBuilder::new(&network, 3, Isa::best()).unwrap();
         let mut rig = builder.build(&ring(3, network.image, 1.0)).unwrap();
         for turn in turns {
             let cameras = ring(3, network.image, turn);
@@ -218,7 +219,7 @@ fn threads_do_not_show() {
         assert!(on(threads) == one, "{threads} threads");
     }
     // One builder on pools of different sizes.
-    let mut builder = RigBuilder::new(&network, 5).unwrap();
+    let mut builder = RigBuilder::new(&network, 5, Isa::best()).unwrap();
     for threads in [1, 4, 2] {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
         assert!(pool.install(|| builder.build(&cameras)).unwrap() == one);
@@ -229,7 +230,7 @@ fn threads_do_not_show() {
 fn rebuilding_keeps_memory() {
     let network = small();
     let cameras = ring(6, network.image, 0.2);
-    let mut builder = RigBuilder::new(&network, 6).unwrap();
+    let mut builder = RigBuilder::new(&network, 6, Isa::best()).unwrap();
     let mut rig = builder.build(&cameras).unwrap();
     let at = |rig: &Rig| [0, 1, 2].map(|l| (rig.level(l).volume.col.as_ptr(), rig.level(l).bev.ptr.as_ptr()));
     let before = at(&rig);
@@ -240,7 +241,7 @@ fn rebuilding_keeps_memory() {
 #[test]
 fn a_refused_rebuild_changes_nothing() {
     let network = small();
-    let mut builder = RigBuilder::new(&network, 2).unwrap();
+    let mut builder = RigBuilder::new(&network, 2, Isa::best()).unwrap();
     let mut rig = builder.build(&ring(2, network.image, 0.2)).unwrap();
     let e = builder.rebuild(&[DOWN; 3], &mut rig).unwrap_err();
     assert_eq!((e.kind(), e.message()), (ErrorKind::Mismatch, "3 camera matrices, the builder expects 2"));
@@ -278,7 +279,7 @@ fn negative_coordinates_that_vanish_count() {
 #[test]
 fn what_cannot_be_built_is_refused_at_once() {
     let refused = |network: Network, cameras: usize, expected: &str| {
-        let e = RigBuilder::new(&network, cameras).unwrap_err();
+        let e = RigBuilder::new(&network, cameras, Isa::best()).unwrap_err();
         assert_eq!(e.kind(), ErrorKind::TooLarge);
         assert!(e.message().contains(expected), "{e}");
     };
@@ -289,8 +290,8 @@ fn what_cannot_be_built_is_refused_at_once() {
     let mut all = network([16384, 16384, 16384], [65536; 3], [65536, 65536], Sampling::Linspace);
     refused(all.clone(), usize::MAX, "voxels");
     all.image = [33, 32];
-    assert_eq!(RigBuilder::new(&all, 1).unwrap_err().kind(), ErrorKind::Format, "an unchecked network");
-    assert_eq!(RigBuilder::new(&small(), 0).unwrap_err().kind(), ErrorKind::Format);
+    assert_eq!(RigBuilder::new(&all, 1, Isa::best()).unwrap_err().kind(), ErrorKind::Format, "an unchecked network");
+    assert_eq!(RigBuilder::new(&small(), 0, Isa::best()).unwrap_err().kind(), ErrorKind::Format);
 }
 
 // Files.
@@ -318,7 +319,7 @@ fn a_saved_rig_maps_back() {
     assert_eq!(fs::read(&again).unwrap(), fs::read(&path).unwrap());
     // A mapped rig can be rebuilt, and the file stays as it is.
     let cameras = ring(2, network.image, 2.0);
-    RigBuilder::new(&network, 2).unwrap().rebuild(&cameras, &mut mapped).unwrap();
+    RigBuilder::new(&network, 2, Isa::best()).unwrap().rebuild(&cameras, &mut mapped).unwrap();
     assert!(mapped == build(&network, &cameras) && !mapped.is_mapped());
     assert!(Rig::open(&path, &network, 2).unwrap() == rig);
     let metadata = Container::open(&path).unwrap().metadata().clone();

@@ -58,7 +58,7 @@ impl Source for Case {
     }
     fn piece<'a, S: Simd>(&'a self, _: S, row: usize, k: usize, spare: &'a mut [f32]) -> &'a [f32] {
         let here = &self.left[row * self.owned.depth + k..][..spare.len()];
-        if self.stored || (row + k) % 3 == 0 {
+        if self.stored || (row + k).is_multiple_of(3) {
             return here;
         }
         spare.copy_from_slice(here);

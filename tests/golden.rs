@@ -1,0 +1,290 @@
+//! Whole networks against golden cases: every stage, within the tolerance that `golden/manifest.json` states and explains.
+//! `VOXCAST_SHOW=1` prints the tables of differences that a failure would show.
+
+use safetensors::{Dtype, SafeTensors};
+use serde_json::Value;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Write;
+use std::path::PathBuf;
+use std::sync::Arc;
+use voxcast::checkpoint::Checkpoint;
+use voxcast::container::{self, Data, Layout, Tensor};
+use voxcast::graph::{Graph, Op, Rewrites};
+use voxcast::import::import;
+use voxcast::model::Options;
+use voxcast::rig::RigBuilder;
+use voxcast::session::views;
+use voxcast::weights::Precision;
+use voxcast::{Isa, Model, Network, Rig, Scene, Session, SessionOptions, Threads};
+
+fn golden() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/golden")
+}
+
+fn manifest() -> Value {
+    serde_json::from_str(&std::fs::read_to_string(golden().join("manifest.json")).unwrap()).unwrap()
+}
+
+/// A golden case with everything but its expected stages read.
+struct Case {
+    name: String,
+    network: Network,
+    scene: Scene,
+    checkpoint: Checkpoint,
+    expected: Vec<u8>,
+    left_out: BTreeSet<String>,
+    rig: Arc<Rig>,
+    directory: tempfile::TempDir,
+}
+
+/// What a run gave: stages in running order, channels last, cameras one after the other; and the classes.
+struct Found {
+    stages: Vec<Stage>,
+    classes: Vec<u8>,
+}
+
+struct Stage {
+    name: String,
+    channels: usize,
+    /// Positions of one camera, or of the frame.
+    rows: usize,
+    values: Vec<f32>,
+}
+
+/// How far apart a stage may be, over the root mean square of what is expected.
+#[derive(Clone, Copy)]
+struct Tolerance {
+    /// The largest difference.
+    max: f64,
+    /// The root mean square of the differences.
+    rms: f64,
+    /// The share of voxels that must get the expected class.
+    classes: f64,
+}
+
+fn tolerance(precision: Precision) -> Tolerance {
+    let tolerance = &manifest()["tolerance"][precision.name()];
+    let get = |key: &str| tolerance[key].as_f64().unwrap();
+    Tolerance { max: get("max"), rms: get("rms"), classes: get("equal_classes") }
+}
+
+fn cases() -> Vec<Case> {
+    let manifest = manifest();
+    let cases: Vec<Case> = manifest["cases"].as_array().unwrap().iter().map(Case::read).collect();
+    assert!(cases.len() >= 2);
+    cases
+}
+
+impl Case {
+    fn read(entry: &Value) -> Self {
+        let name = entry["name"].as_str().unwrap().to_owned();
+        let from = golden().join(&name);
+        let network = Network::from_json(&std::fs::read_to_string(from.join("network.json")).unwrap()).unwrap();
+        let scene = Scene::open(&from.join("scene.safetensors")).unwrap();
+        scene.check(&network).unwrap();
+        let expected = std::fs::read(from.join("expected.safetensors")).unwrap();
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("rig");
+        write_rig(&SafeTensors::deserialize(&expected).unwrap(), &path);
+        Case {
+            rig: Arc::new(Rig::open(&path, &network, scene.cameras()).unwrap()),
+            checkpoint: Checkpoint::open(from.join(entry["checkpoint"].as_str().unwrap())).unwrap(),
+            left_out: entry["left_out"].as_array().unwrap().iter().map(|v| v.as_str().unwrap().to_owned()).collect(),
+            name,
+            network,
+            scene,
+            expected,
+            directory,
+        }
+    }
+
+    fn expected(&self) -> SafeTensors<'_> {
+        SafeTensors::deserialize(&self.expected).unwrap()
+    }
+
+    fn model(&self, precision: Precision, rewrites: Rewrites) -> Arc<Model> {
+        let path = self.directory.path().join("model");
+        let options = Options { precision, rewrites };
+        import(&self.checkpoint, &self.network, options, &path, &mut |_, _| ()).unwrap();
+        Arc::new(Model::open(&path).unwrap())
+    }
+
+    /// Runs every stage there is.
+    fn run(&self, model: Arc<Model>, unfolded: bool) -> Found {
+        let options = SessionOptions {
+            threads: Threads::new(2).unwrap(),
+            unfolded,
+            logits: true,
+            coarse_heads: true,
+            ..SessionOptions::default()
+        };
+        let mut session = Session::new(model, self.rig.clone(), &options).unwrap();
+        let graph = session.graph().clone();
+        let mut stages: Vec<Stage> = vec![];
+        let result = session
+            .run_observed(&views(&self.scene), &mut |event| {
+                let Some(name) = &event.operation.stage else { return };
+                let tensor = graph.tensor(event.operation.output);
+                let (channels, rows) = (tensor.channels, tensor.rows());
+                assert_eq!(event.output.len(), channels * rows, "{name}");
+                assert_eq!(matches!(event.operation.op, Op::Head { .. }), name.starts_with("logits."));
+                match stages.iter_mut().find(|s| s.name == *name) {
+                    Some(stage) => stage.values.extend(event.output),
+                    None => stages.push(Stage { name: name.clone(), channels, rows, values: event.output.to_vec() }),
+                }
+            })
+            .unwrap();
+        Found { stages, classes: result.classes.to_vec() }
+    }
+
+    /// Compares `found` with the expected stages, which must be exactly those of `graph`.
+    fn compare(&self, what: &str, graph: &Graph, found: &Found, tolerance: Tolerance) {
+        let expected = self.expected();
+        let mut table = format!("{}, {what}: differences over the stage's rms\n", self.name);
+        writeln!(table, "{:24} {:>9} {:>9}", "", "max", "rms").unwrap();
+        writeln!(table, "{:24} {:9.1e} {:9.1e}", "at most", tolerance.max, tolerance.rms).unwrap();
+        let mut good = true;
+        let mut seen = BTreeSet::new();
+        for stage in &found.stages {
+            seen.insert(stage.name.clone());
+            if self.left_out.contains(&stage.name) {
+                continue;
+            }
+            let tensor = expected.tensor(&stage.name).unwrap_or_else(|e| panic!("{}: {e}", stage.name));
+            assert_eq!(tensor.dtype(), Dtype::F32, "{}", stage.name);
+            let values = floats(tensor.data());
+            assert_eq!(values.len(), stage.values.len(), "{} has shape {:?}", stage.name, tensor.shape());
+            let (max, rms) = difference(stage, &values);
+            let fits = max <= tolerance.max && rms <= tolerance.rms;
+            good &= fits;
+            let mark = if fits { "" } else { "  <- too far" };
+            writeln!(table, "{:24} {max:9.2e} {rms:9.2e}{mark}", stage.name).unwrap();
+        }
+        let classes = expected.tensor("classes").unwrap();
+        assert_eq!(classes.data().len(), found.classes.len());
+        let equal = classes.data().iter().zip(&found.classes).filter(|(a, b)| a == b).count();
+        let share = equal as f64 / found.classes.len() as f64;
+        writeln!(table, "classes equal {share:.5}, at least {}", tolerance.classes).unwrap();
+        assert!(good && share >= tolerance.classes, "{table}");
+        let stages: BTreeSet<String> = graph.stages().map(str::to_owned).collect();
+        assert_eq!(seen, stages, "every stage is observed");
+    }
+}
+
+/// The expected matrices as a plain rig, such as another program would write.
+fn write_rig(expected: &SafeTensors<'_>, path: &std::path::Path) {
+    let mut tensors = vec![];
+    for level in 1..=3 {
+        for matrix in ["volume", "bev"] {
+            for part in ["ptr", "col"] {
+                let words: Vec<u8> = integers(expected, &format!("level{level}.csr_{matrix}.{part}"))
+                    .into_iter()
+                    .flat_map(u32::to_le_bytes)
+                    .collect();
+                tensors.push(Tensor {
+                    name: format!("level{level}.{matrix}.{part}"),
+                    dtype: Dtype::U32,
+                    shape: vec![words.len() / 4],
+                    data: Data::Make(Box::new(move || Ok(words))),
+                });
+            }
+        }
+    }
+    container::write(path, tensors, &BTreeMap::new(), Layout::Packed).unwrap();
+}
+
+fn integers(expected: &SafeTensors<'_>, name: &str) -> Vec<u32> {
+    let tensor = expected.tensor(name).unwrap();
+    assert_eq!(tensor.dtype(), Dtype::I64, "{name}");
+    tensor.data().as_chunks().0.iter().map(|&b| u32::try_from(i64::from_le_bytes(b)).unwrap()).collect()
+}
+
+fn floats(bytes: &[u8]) -> Vec<f32> {
+    bytes.as_chunks().0.iter().map(|&b| f32::from_le_bytes(b)).collect()
+}
+
+/// The largest difference and the root mean square of all, both over the root mean square of what is expected. Only logits
+/// are channels last on both sides.
+fn difference(stage: &Stage, expected: &[f32]) -> (f64, f64) {
+    let square: f64 = expected.iter().map(|&v| f64::from(v) * f64::from(v)).sum();
+    let rms = (square / expected.len() as f64).sqrt().max(f64::MIN_POSITIVE);
+    let (rows, channels) = (stage.rows, stage.channels);
+    let (mut largest, mut squares) = (0.0f64, 0.0);
+    for (i, &found) in stage.values.iter().enumerate() {
+        let (camera, row, channel) = (i / (rows * channels), i / channels % rows, i % channels);
+        let at = if stage.name.starts_with("logits.") { i } else { (camera * channels + channel) * rows + row };
+        let off = (f64::from(found) - f64::from(expected[at])).abs();
+        squares += off * off;
+        // `max` would drop a NaN.
+        largest = if off > largest || off.is_nan() { off } else { largest };
+    }
+    (largest / rms, (squares / expected.len() as f64).sqrt() / rms)
+}
+
+#[test]
+fn unfolded_stages_agree() {
+    for case in cases() {
+        let model = case.model(Precision::F32, Rewrites::ALL);
+        let found = case.run(model.clone(), true);
+        let graph = model.graph(true, true);
+        assert!(graph.stages().any(|s| s == "level1.gather.volume"));
+        case.compare("projection kept", &graph, &found, tolerance(Precision::F32));
+    }
+}
+
+#[test]
+fn folded_stages_agree() {
+    for case in cases() {
+        let model = case.model(Precision::F32, Rewrites::ALL);
+        let found = case.run(model.clone(), false);
+        let graph = model.graph(false, true);
+        assert!(!graph.stages().any(|s| s == "level1.gather.volume") && graph.stages().any(|s| s == "level1.volume"));
+        case.compare("projection folded", &graph, &found, tolerance(Precision::F32));
+    }
+}
+
+#[test]
+fn stages_without_any_rewrite_agree() {
+    for case in cases() {
+        let model = case.model(Precision::F32, Rewrites::NONE);
+        let found = case.run(model.clone(), false);
+        case.compare("no rewrites", &model.graph(false, true), &found, tolerance(Precision::F32));
+    }
+}
+
+#[test]
+fn half_precision_agrees() {
+    for case in cases() {
+        let model = case.model(Precision::F16, Rewrites::ALL);
+        for unfolded in [false, true] {
+            let found = case.run(model.clone(), unfolded);
+            case.compare("half precision", &model.graph(unfolded, true), &found, tolerance(Precision::F16));
+        }
+    }
+}
+
+#[test]
+fn matrices_are_exactly_those_expected() {
+    for case in cases() {
+        let built = RigBuilder::new(&case.network, case.scene.cameras(), Isa::best())
+            .unwrap()
+            .build(&case.scene.lidar2img)
+            .unwrap();
+        let entries: usize = (0..3).map(|l| built.level(l).volume.col.len()).sum();
+        assert!(entries > 500, "{}: {entries} entries show little", case.name);
+        assert!(built == *case.rig, "{}: built {built:?}, expected {:?}", case.name, case.rig);
+    }
+}
+
+#[test]
+fn the_comparison_sees_a_single_wrong_number() {
+    let stage = |values: &[f32]| Stage { name: "x".into(), channels: 2, rows: 2, values: values.to_vec() };
+    // Channels first: [[1, 2], [3, 4]] is channels last [1, 3, 2, 4].
+    let expected = [1.0, 2.0, 3.0, 4.0];
+    assert_eq!(difference(&stage(&[1.0, 3.0, 2.0, 4.0]), &expected), (0.0, 0.0));
+    let (max, rms) = difference(&stage(&[1.0, 3.0, 2.0, 4.5]), &expected);
+    assert!((max - 0.5 / 7.5f64.sqrt()).abs() < 1e-12, "{max}");
+    assert!((rms - 0.25 / 7.5f64.sqrt()).abs() < 1e-12, "{rms}");
+    let (max, rms) = difference(&stage(&[1.0, f32::NAN, 2.0, 4.0]), &expected);
+    assert!(!(max <= 1.0 || rms <= 1.0), "NaN fits no tolerance: {max}, {rms}");
+}
