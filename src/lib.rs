@@ -75,8 +75,8 @@ import(&checkpoint, &network, Options::default(), Path::new("model.safetensors")
 //! # Memory and threads
 //!
 //! [`Session::new`] takes the arena and the output from the system, [`Session::memory`] says beforehand how much, and
-//! frames reuse them. Weights and matrices are used where they are mapped. A session computes on the calling thread, on a
-//! pool of its own, or on one that it is given ([`Threads`]).
+//! frames reuse them. Weights and matrices are used where they are mapped. A session computes on the calling thread, with
+//! threads of its own, or on a pool that it is given ([`Threads`]).
 //!
 //! # Determinism
 //!
