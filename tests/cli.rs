@@ -1,5 +1,7 @@
 //! The program from outside: what it does, what it prints, how it ends; and every kind of input that is at fault.
 
+#![allow(clippy::type_complexity, reason = "tables of edits are read once, where they stand")]
+
 #[path = "support/pth.rs"]
 #[allow(dead_code, reason = "the checkpoint tests use the rest")]
 mod pth;
