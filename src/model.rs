@@ -248,3 +248,6 @@ pub(crate) fn check_options(options: Options) -> Result<()> {
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests;

@@ -71,7 +71,7 @@ fn refused_or_done(file: &str, arguments: &[&str]) {
 }
 
 /// Weights that write down what they were asked for.
-struct Recorder(RefCell<BTreeMap<String, (Vec<usize>, Vec<f32>)>>);
+struct Recorder(RefCell<Tensors>);
 
 impl Source for Recorder {
     fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>> {
@@ -81,6 +81,7 @@ impl Source for Recorder {
     }
 }
 
+/// Shape and values by name.
 type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
 fn network() -> Network {
@@ -347,7 +348,8 @@ fn files_that_are_not_there() {
 #[test]
 fn names_and_numbers_that_are_unknown() {
     let place = Place::ready();
-    let [weights, model, scene, out, dump] = ["weights.pth", "model", "scene", "out.npz", "dump"].map(|f| place.text(f));
+    let [weights, model, scene, out, dump] =
+        ["weights.pth", "model", "scene", "out.npz", "dump"].map(|f| place.text(f));
     let line = refused("nuscenes-999", &["import", &weights, "--network", "nuscenes-999", "-o", &out]);
     assert!(line.contains("nuscenes-200"), "{line}");
     let line = refused("--isa", &["run", "--model", &model, &scene, "-o", &out, "--isa", "mmx"]);
@@ -419,7 +421,8 @@ fn rigs_that_do_not_belong_here() {
     };
     fs::write(&bad, plain("", &|_| ())).unwrap();
     done(&words(&place.run("model", "bad", "scene")));
-    let cases: [(&str, &dyn Fn(&mut Vec<u32>), &str); 7] = [
+    type Edit<'a> = &'a dyn Fn(&mut Vec<u32>);
+    let cases: [(&str, Edit<'_>, &str); 7] = [
         ("level1.volume.col", &|w| *w.last_mut().unwrap() = u32::MAX, "4294967295"),
         ("level3.bev.col", &|w| *w.last_mut().unwrap() = 4, "less than 4"),
         ("level1.bev.ptr", &|w| w[5] = u32::MAX, "row 4"),
@@ -469,11 +472,20 @@ fn damaged_checkpoints_leave_the_old_model() {
 fn weights_that_cannot_be_used_are_named() {
     let place = Place::new();
     let sound = place.tensors();
-    let edits: [(&str, &dyn Fn(&mut Tensors), &str); 6] = [
+    type Edit<'a> = &'a dyn Fn(&mut Tensors);
+    let edits: [(&str, Edit<'_>, &str); 6] = [
         ("img_backbone.conv1.weight", &|t| t.get_mut("img_backbone.conv1.weight").unwrap().1[7] = f32::NAN, "NaN"),
         ("img_neck.fpn_convs.1.conv.bias", &|t| drop(t.remove("img_neck.fpn_convs.1.conv.bias")), "missing"),
-        ("occ_head.mlp_occ_lvl0.4.bias", &|t| t.get_mut("occ_head.mlp_occ_lvl0.4.bias").unwrap().1[2] = f32::INFINITY, "inf"),
-        ("img_backbone.bn1.running_var", &|t| t.get_mut("img_backbone.bn1.running_var").unwrap().1[1] = -1.0, "variance"),
+        (
+            "occ_head.mlp_occ_lvl0.4.bias",
+            &|t| t.get_mut("occ_head.mlp_occ_lvl0.4.bias").unwrap().1[2] = f32::INFINITY,
+            "inf",
+        ),
+        (
+            "img_backbone.bn1.running_var",
+            &|t| t.get_mut("img_backbone.bn1.running_var").unwrap().1[1] = -1.0,
+            "variance",
+        ),
         (
             "view_transformer.up_sample1.0.weight",
             &|t| t.get_mut("view_transformer.up_sample1.0.weight").unwrap().0.swap(0, 1),
@@ -511,7 +523,8 @@ fn weights_that_cannot_be_used_are_named() {
 fn a_pickle_that_would_call_something_is_refused() {
     let place = Place::new();
     let marker = place.text("marker");
-    for (module, name) in [("os", "system"), ("builtins", "eval"), ("posix", "system"), ("subprocess", "check_output")] {
+    for (module, name) in [("os", "system"), ("builtins", "eval"), ("posix", "system"), ("subprocess", "check_output")]
+    {
         let evil = pth::Pickle::new(2).global(module, name).text(&format!("touch {marker}")).raw(b"\x85R").stop();
         fs::write(place.path("evil.pth"), pth::pth_of(evil, &["0"])).unwrap();
         let line = refused("evil.pth", &words(&place.import("evil.pth", "network.json")));

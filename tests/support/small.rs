@@ -70,7 +70,8 @@ pub(crate) fn lidar2img(network: &Network, turn: f32) -> Vec<[f32; 16]> {
             let (s, c) = (std::f32::consts::TAU * i as f32 / network.cameras as f32 + turn).sin_cos();
             let (right, down, ahead) = ([s, -c, 0.0, 0.1], [0.0, 0.0, -1.0, 0.3], [c, s, 0.0, -0.5]);
             let row = |a: [f32; 4], f: f32, centre: f32| std::array::from_fn(|k| f * a[k] + centre * ahead[k]);
-            let rows: [[f32; 4]; 4] = [row(right, focal, centre_u), row(down, focal, centre_v), ahead, [0., 0., 0., 1.]];
+            let rows: [[f32; 4]; 4] =
+                [row(right, focal, centre_u), row(down, focal, centre_v), ahead, [0., 0., 0., 1.]];
             rows.concat().try_into().unwrap()
         })
         .collect()
