@@ -9,6 +9,8 @@ mod backbone;
 mod head;
 mod neck;
 mod rewrite;
+#[cfg(test)]
+mod tests;
 mod view;
 
 use crate::network::Network;

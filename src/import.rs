@@ -377,3 +377,6 @@ fn padded(values: &[f64]) -> Vec<f32> {
     out.resize(values.len().next_multiple_of(LANES), 0.0);
     out
 }
+
+#[cfg(test)]
+mod tests;

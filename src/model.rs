@@ -246,3 +246,6 @@ pub(crate) fn check_options(options: Options) -> Result<()> {
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests;

@@ -259,3 +259,86 @@ impl Network {
         std::array::from_fn(|a| (self.bounds[a][1] - self.bounds[a][0]) / grid[a] as f32)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::{Value, json};
+
+    fn sound() -> Value {
+        serde_json::to_value(Network::built_in("nuscenes-200")).expect("plain numbers")
+    }
+
+    #[test]
+    fn built_in_networks_are_sound_and_survive_json() {
+        for name in BUILT_IN {
+            let network = Network::built_in(name).expect("built in");
+            network.check().expect("sound");
+            assert_eq!(Network::from_json(&network.to_json()).expect("its own JSON"), network);
+        }
+        assert_eq!(Network::built_in("nuscenes"), None);
+    }
+
+    #[test]
+    fn sizes_of_the_published_network() {
+        let network = Network::built_in("nuscenes-200").expect("built in");
+        assert_eq!(network.output_grid(), [200, 200, 16]);
+        assert_eq!([0, 1, 2].map(|l| network.feature_size(l)), [[116, 200], [58, 100], [29, 50]]);
+        assert_eq!(network.feature_pixels(2), 1450);
+        assert_eq!(network.voxel_size(), [0.5; 3]);
+        assert_eq!((Block::Bottleneck.expansion(), Block::Basic.expansion()), (4, 1));
+    }
+
+    #[test]
+    fn keys_with_a_default_may_be_missing() {
+        let mut network = sound();
+        for key in ["block", "strides", "sampling", "cameras"] {
+            network.as_object_mut().expect("an object").remove(key);
+        }
+        assert_eq!(Network::from_json(&network.to_string()).ok(), Network::built_in("nuscenes-200"));
+        for key in ["depths", "width", "dcn", "fpn", "channels", "key_dims", "bounds", "classes", "image", "grids", "samples"]
+        {
+            let mut network = sound();
+            network.as_object_mut().expect("an object").remove(key);
+            let error = Network::from_json(&network.to_string()).expect_err("a key is missing");
+            assert!(error.message().contains(&format!("missing field `{key}`")), "{error}");
+        }
+    }
+
+    #[test]
+    fn each_rule_names_its_key() {
+        let side = |v: usize| json!([[4 * v, 4, 4], [2 * v, 2, 2], [v, 1, 1]]);
+        let cases = [
+            ("/depths/2", json!(0), "\"depths\": found [3, 4, 0, 3]"),
+            ("/depths/2", json!(257), "1 to 256"),
+            ("/width", json!(65537), "\"width\": found [65537], expected values from 1 to 65536"),
+            ("/fpn", json!(0), "\"fpn\""),
+            ("/samples/0", json!(0), "\"samples\""),
+            ("/cameras", json!(0), "\"cameras\""),
+            ("/classes", json!(1), "\"classes\": found 1, expected 2 to 256"),
+            ("/classes", json!(257), "\"classes\""),
+            ("/strides/0", json!(4), "\"strides\""),
+            ("/image/0", json!(900), "\"image\": found [900, 1600]"),
+            ("/image/1", json!(16_416), "up to 16384"),
+            ("/block", json!("basic"), "\"dcn\""),
+            ("/channels/1", json!(60), "\"channels\": found 60, expected multiples of 8"),
+            ("/key_dims/1", json!(8), "\"key_dims\": found 8, expected 16 at level 2"),
+            ("/grids/1/0", json!(51), "each level exactly half"),
+            ("/grids/0/2", json!(0), "\"grids\""),
+            ("/grids", json!([[2048, 2048, 512], [1024, 1024, 256], [512, 512, 128]]), "17179869184"),
+            ("/bounds/2", json!([3, -5]), "[3, -5] on z"),
+            ("/bounds/0", json!([1, 1]), "ascending"),
+            ("/bounds/0/0", json!(1e39), "finite"),
+        ];
+        for (pointer, value, expected) in cases {
+            let mut network = sound();
+            *network.pointer_mut(pointer).expect("a key") = value;
+            let error = Network::from_json(&network.to_string()).expect_err(pointer);
+            assert_eq!(error.kind(), crate::ErrorKind::Format);
+            assert!(error.message().contains(expected), "{pointer}: {error} (expected {expected})");
+        }
+        let mut network = sound();
+        network["grids"] = side(1);
+        Network::from_json(&network.to_string()).expect("the smallest grid");
+    }
+}

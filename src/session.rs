@@ -359,3 +359,6 @@ fn check_rig(rig: &Rig, network: &Network, cameras: usize) -> Result<()> {
     }
     Ok(())
 }
+
+#[cfg(test)]
+mod tests;

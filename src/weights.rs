@@ -106,3 +106,62 @@ pub fn parts(graph: &Graph, operation: &Operation) -> Vec<Part> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::graph::Rewrites;
+    use crate::network::{BUILT_IN, Network};
+
+    #[test]
+    fn precisions_have_names() {
+        for precision in [Precision::F32, Precision::F16] {
+            assert_eq!(Precision::parse(precision.name()), Some(precision));
+        }
+        assert_eq!(Precision::parse("F32"), None);
+    }
+
+    #[test]
+    fn parts_fill_whole_cache_lines() {
+        let plain = Part::plain("bias", 17);
+        assert_eq!([Precision::F32, Precision::F16].map(|p| (plain.width(p), plain.stored_len(p))), [(4, 32), (4, 32)]);
+        let panels = Part::panels("weight", 17);
+        assert_eq!([Precision::F32, Precision::F16].map(|p| (panels.width(p), panels.stored_len(p))), [(4, 32), (2, 32)]);
+        assert_eq!(Part::panels("weight", 64).stored_len(Precision::F16), 64);
+    }
+
+    #[test]
+    fn no_operation_has_more_parts_than_a_session_has_room_for() {
+        for name in BUILT_IN {
+            let network = Network::built_in(name).expect("built in");
+            for rewrites in [Rewrites::ALL, Rewrites::NONE] {
+                let graph = Graph::build(&network, true).rewritten(rewrites);
+                let counts: Vec<usize> = graph.operations.iter().map(|o| parts(&graph, o).len()).collect();
+                assert_eq!(counts.iter().max(), Some(&MAX_PARTS));
+                for operation in &graph.operations {
+                    let parts = parts(&graph, operation);
+                    assert_eq!(parts.is_empty(), operation.recipe == Recipe::None, "{}", operation.name);
+                    assert!(parts.iter().all(|p| p.len > 0), "{}", operation.name);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn stored_sizes_of_known_operations() {
+        let graph = Graph::build(&Network::built_in("nuscenes-200").expect("built in"), false).rewritten(Rewrites::ALL);
+        let lens = |name: &str| {
+            let operation = graph.operations.iter().find(|o| o.name == name).expect(name);
+            parts(&graph, operation).iter().map(|p| p.len).collect::<Vec<_>>()
+        };
+        assert_eq!(lens("img_backbone.conv1"), [7 * 7 * 3 * 64, 64]);
+        // 27 offsets and mask logits fill two panels of 16.
+        assert_eq!(lens("img_backbone.layer3.0.conv2.conv_offset"), [9 * 256 * 32, 32]);
+        // 64 channels for the volume and 64 for the plane.
+        assert_eq!(lens("img_neck.fpn_convs.0.conv.projected"), [9 * 512 * 128, 128]);
+        assert_eq!(lens("view_transformer.up_sample1.0"), [8 * 8 * 64 * 32, 32]);
+        assert_eq!(lens("view_transformer.imvts.0.combine_coeff"), [64, 16]);
+        // 17 classes fill two panels.
+        assert_eq!(lens("occ_head.mlp_occ_lvl0"), [32 * 32, 32, 32 * 32, 32, 32 * 32, 32]);
+    }
+}

@@ -73,7 +73,7 @@ fn refused_or_done(file: &str, arguments: &[&str]) {
 }
 
 /// Weights that write down what they were asked for.
-struct Recorder(RefCell<BTreeMap<String, (Vec<usize>, Vec<f32>)>>);
+struct Recorder(RefCell<Tensors>);
 
 impl Source for Recorder {
     fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>> {
@@ -83,6 +83,7 @@ impl Source for Recorder {
     }
 }
 
+/// Shape and values by name.
 type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
 fn network() -> Network {
@@ -422,7 +423,8 @@ fn rigs_that_do_not_belong_here() {
     };
     fs::write(&bad, plain("", &|_| ())).unwrap();
     done(&words(&place.run("model", "bad", "scene")));
-    let cases: [(&str, &dyn Fn(&mut Vec<u32>), &str); 7] = [
+    type Edit<'a> = &'a dyn Fn(&mut Vec<u32>);
+    let cases: [(&str, Edit<'_>, &str); 7] = [
         ("level1.volume.col", &|w| *w.last_mut().unwrap() = u32::MAX, "4294967295"),
         ("level3.bev.col", &|w| *w.last_mut().unwrap() = 4, "less than 4"),
         ("level1.bev.ptr", &|w| w[5] = u32::MAX, "row 4"),
@@ -472,7 +474,8 @@ fn damaged_checkpoints_leave_the_old_model() {
 fn weights_that_cannot_be_used_are_named() {
     let place = Place::new();
     let sound = place.tensors();
-    let edits: [(&str, &dyn Fn(&mut Tensors), &str); 6] = [
+    type Edit<'a> = &'a dyn Fn(&mut Tensors);
+    let edits: [(&str, Edit<'_>, &str); 6] = [
         ("img_backbone.conv1.weight", &|t| t.get_mut("img_backbone.conv1.weight").unwrap().1[7] = f32::NAN, "NaN"),
         ("img_neck.fpn_convs.1.conv.bias", &|t| drop(t.remove("img_neck.fpn_convs.1.conv.bias")), "missing"),
         (

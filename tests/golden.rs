@@ -1,5 +1,4 @@
 //! Whole networks against golden cases: every stage, within the tolerance that `golden/manifest.json` states and explains.
-//! `VOXCAST_SHOW=1` prints the tables of differences that a failure would show.
 
 use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;

@@ -283,11 +283,11 @@ fn what_cannot_be_built_is_refused_at_once() {
         assert_eq!(e.kind(), ErrorKind::TooLarge);
         assert!(e.message().contains(expected), "{e}");
     };
-    refused(network([16384, 16384, 1], [1; 3], [64, 64], Sampling::Linspace), 1, "17179869184 voxels");
+    refused(network([4096, 2048, 1], [1; 3], [64, 64], Sampling::Linspace), 1, "536870912 voxels");
     refused(network([25, 25, 2], [4, 5, 512], [64, 64], Sampling::Linspace), 6, "level 3");
     refused(network([1, 1, 1], [1, 1, 2048], [64, 64], Sampling::Linspace), 1, "of a column");
-    refused(network([1, 1, 1], [1; 3], [65536, 65536], Sampling::Linspace), 65, "feature pixels of all cameras");
-    let mut all = network([16384, 16384, 16384], [65536; 3], [65536, 65536], Sampling::Linspace);
+    refused(network([1, 1, 1], [1; 3], [16384, 16384], Sampling::Linspace), 1025, "feature pixels of all cameras");
+    let mut all = network([4096, 2048, 1], [65536; 3], [16384, 16384], Sampling::Linspace);
     refused(all.clone(), usize::MAX, "voxels");
     all.image = [33, 32];
     assert_eq!(RigBuilder::new(&all, 1, Isa::best()).unwrap_err().kind(), ErrorKind::Format, "an unchecked network");
