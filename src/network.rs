@@ -296,7 +296,8 @@ mod tests {
             network.as_object_mut().expect("an object").remove(key);
         }
         assert_eq!(Network::from_json(&network.to_string()).ok(), Network::built_in("nuscenes-200"));
-        for key in ["depths", "width", "dcn", "fpn", "channels", "key_dims", "bounds", "classes", "image", "grids", "samples"]
+        for key in
+            ["depths", "width", "dcn", "fpn", "channels", "key_dims", "bounds", "classes", "image", "grids", "samples"]
         {
             let mut network = sound();
             network.as_object_mut().expect("an object").remove(key);

@@ -126,7 +126,10 @@ mod tests {
         let plain = Part::plain("bias", 17);
         assert_eq!([Precision::F32, Precision::F16].map(|p| (plain.width(p), plain.stored_len(p))), [(4, 32), (4, 32)]);
         let panels = Part::panels("weight", 17);
-        assert_eq!([Precision::F32, Precision::F16].map(|p| (panels.width(p), panels.stored_len(p))), [(4, 32), (2, 32)]);
+        assert_eq!(
+            [Precision::F32, Precision::F16].map(|p| (panels.width(p), panels.stored_len(p))),
+            [(4, 32), (2, 32)]
+        );
         assert_eq!(Part::panels("weight", 64).stored_len(Precision::F16), 64);
     }
 

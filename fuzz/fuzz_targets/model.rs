@@ -55,7 +55,7 @@ fn run(model: Model) {
     if network.cameras > 4 || network.samples.iter().any(|&n| n > 16) || (0..3).any(|l| points(l) > MAX_POINTS) {
         return;
     }
-    let Ok(mut builder) = RigBuilder::new(&network, network.cameras) else { return };
+    let Ok(mut builder) = RigBuilder::new(&network, network.cameras, voxcast::Isa::best()) else { return };
     let down = [8., 0., 0., 20., 0., 8., 0., 15., 0., 0., 0., 1., 0., 0., 0., 1.];
     let rig = Arc::new(builder.build(&vec![down; network.cameras]).expect("a small rig"));
     let model = Arc::new(model);

@@ -18,7 +18,7 @@ const CAMERAS: usize = 2;
 fn sound() -> Vec<(String, Vec<u32>)> {
     let camera = [20., 0., 8., 30., 0., 20., 0., 15., 0.1, 0., 0.5, 1., 0., 0., 0., 1.];
     let other = [-20., 5., 8., 30., 0., -20., 0., 15., 0.1, 0., -0.5, 1., 0., 0., 0., 1.];
-    let mut builder = RigBuilder::new(&network(), CAMERAS).expect("a small network");
+    let mut builder = RigBuilder::new(&network(), CAMERAS, voxcast::Isa::best()).expect("a small network");
     let rig = builder.build(&[camera, other]).expect("a small rig");
     let mut tensors = vec![];
     for l in 0..3 {

@@ -33,7 +33,7 @@ fn model() -> Arc<Model> {
 const AHEAD: [f32; 16] = [32., -40., 0., 0., 16., 0., -40., 0., 1., 0., 0., 0., 0., 0., 0., 1.];
 
 fn rig(network: &Network, cameras: usize) -> Arc<Rig> {
-    let built = RigBuilder::new(network, cameras).and_then(|mut b| b.build(&vec![AHEAD; cameras]));
+    let built = RigBuilder::new(network, cameras, Isa::best()).and_then(|mut b| b.build(&vec![AHEAD; cameras]));
     Arc::new(built.expect("a rig"))
 }
 

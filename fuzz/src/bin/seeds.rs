@@ -45,7 +45,9 @@ fn rigs() -> Vec<(String, Vec<u8>)> {
     let path = std::env::temp_dir().join(format!("voxcast-fuzz-rig-{}", std::process::id()));
     let network = voxcast_fuzz::network();
     let camera = [20., 0., 8., 30., 0., 20., 0., 15., 0.1, 0., 0.5, 1., 0., 0., 0., 1.];
-    let rig = RigBuilder::new(&network, 2).and_then(|mut b| b.build(&[camera; 2])).expect("a small rig");
+    let rig = RigBuilder::new(&network, 2, voxcast::Isa::best())
+        .and_then(|mut b| b.build(&[camera; 2]))
+        .expect("a small rig");
     rig.save(&path, &network).expect("room for a small file");
     let file = std::fs::read(&path).expect("what was just written");
     std::fs::remove_file(&path).expect("what was just read");
