@@ -12,15 +12,15 @@
 //! must have the key, so that no damage can hide it. Other safetensors files need neither.
 
 use crate::error::{Error, ErrorKind, Result};
+use crate::replace::Replacement;
 use memmap2::Mmap;
 use safetensors::Dtype;
 use safetensors::tensor::Metadata;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
-use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::path::Path;
 use xxhash_rust::xxh3::Xxh3;
 
 /// Tensors of [`Layout::Aligned`] and the data as a whole start on multiples of this many bytes: a cache line.
@@ -174,57 +174,6 @@ fn header(tensors: &[Tensor<'_>], metadata: &BTreeMap<String, String>, layout: L
 fn checksum_digits(header: &[u8]) -> Option<usize> {
     let at = header.windows(CHECKSUM_KEY.len()).position(|w| w == CHECKSUM_KEY.as_bytes())? + CHECKSUM_KEY.len();
     (header.get(at + ZEROS.len()) == Some(&b'"')).then_some(at)
-}
-
-/// A file in the making that takes the place of another, or vanishes.
-struct Replacement {
-    file: File,
-    temporary: PathBuf,
-    target: PathBuf,
-    done: bool,
-}
-
-impl Replacement {
-    fn create(path: &Path) -> Result<Self> {
-        // A link stays one: its target is what gets replaced.
-        let target = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
-        if fs::metadata(&target).is_ok_and(|m| !m.is_file()) {
-            return Err(Error::new(ErrorKind::Io, "cannot write: not a regular file").in_file(path));
-        }
-        let Some(name) = target.file_name() else {
-            return Err(Error::new(ErrorKind::Io, "cannot write: the path names no file").in_file(path));
-        };
-        static NEXT: AtomicU32 = AtomicU32::new(0);
-        loop {
-            let mut temporary = std::ffi::OsString::from(".");
-            temporary.push(name);
-            temporary.push(format!(".{}-{}.tmp", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed)));
-            let temporary = target.with_file_name(temporary);
-            match OpenOptions::new().write(true).create_new(true).open(&temporary) {
-                Ok(file) => return Ok(Self { file, temporary, target, done: false }),
-                // Left by a process of the same id that was killed: take the next number.
-                Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {}
-                Err(e) => return Err(Error::io(path, "write", &e)),
-            }
-        }
-    }
-
-    fn commit(mut self, path: &Path) -> Result<()> {
-        // The name must not reach the disk before the bytes.
-        self.file.sync_all().map_err(|e| Error::io(path, "write", &e))?;
-        fs::rename(&self.temporary, &self.target).map_err(|e| Error::io(path, "write", &e))?;
-        self.done = true;
-        Ok(())
-    }
-}
-
-impl Drop for Replacement {
-    fn drop(&mut self) {
-        if !self.done {
-            // Nothing is left to report to: the error that brought us here is on its way.
-            let _ = fs::remove_file(&self.temporary);
-        }
-    }
 }
 
 /// The bytes of a container.

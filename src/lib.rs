@@ -119,7 +119,6 @@ pub mod npz;
 pub mod picture;
 pub mod plan;
 pub mod random;
-#[cfg(any(feature = "npz", feature = "images"))]
 mod replace;
 pub mod rig;
 pub mod scene;

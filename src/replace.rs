@@ -1,42 +1,85 @@
 //! Writing files so that a reader sees the old bytes or the new ones, never a part.
 
-use crate::error::{Error, Result};
-use std::fs::{self, File};
-use std::io::{self, BufWriter, Write};
+use crate::error::{Error, ErrorKind, Result};
+use std::ffi::OsString;
+use std::fs::{self, File, OpenOptions};
+use std::io;
+#[cfg(any(feature = "npz", feature = "images"))]
+use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU32, Ordering};
 
 /// Writes `path` through a temporary file beside it, which takes its name once all bytes are down.
 ///
 /// On failure the temporary file is removed and an existing `path` keeps its bytes.
 ///
 /// # Errors
-/// [`ErrorKind::Io`](crate::ErrorKind::Io) naming `path`.
-pub(crate) fn replace_file(path: &Path, write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>) -> Result<()> {
-    let temporary = temporary_beside(path)
-        .ok_or_else(|| Error::io(path, "write", &io::Error::new(io::ErrorKind::InvalidInput, "not a file name")))?;
-    let written = File::create(&temporary).and_then(|file| {
-        let mut out = BufWriter::with_capacity(1 << 18, file);
-        write(&mut out)?;
-        out.flush()?;
-        drop(out);
-        fs::rename(&temporary, path)
-    });
-    written.map_err(|e| {
-        // The first failure is the one to tell; a leftover that cannot be removed changes nothing about it.
-        let _ = fs::remove_file(&temporary);
-        Error::io(path, "write", &e)
-    })
+/// [`ErrorKind::Io`] naming `path`.
+#[cfg(any(feature = "npz", feature = "images"))]
+pub(crate) fn replace_file(path: &Path, write: impl FnOnce(&mut BufWriter<&File>) -> io::Result<()>) -> Result<()> {
+    let replacement = Replacement::create(path)?;
+    let mut out = BufWriter::with_capacity(1 << 18, &replacement.file);
+    write(&mut out).and_then(|()| out.flush()).map_err(|e| Error::io(path, "write", &e))?;
+    drop(out);
+    replacement.commit(path)
 }
 
-/// A name that two processes do not share and that a listing hides.
-fn temporary_beside(path: &Path) -> Option<PathBuf> {
-    let mut name = std::ffi::OsString::from(".");
-    name.push(path.file_name()?);
-    name.push(format!(".{}.tmp", std::process::id()));
-    Some(path.with_file_name(name))
+/// A file in the making that takes the place of another, or vanishes.
+pub(crate) struct Replacement {
+    /// The temporary file beside the target.
+    pub(crate) file: File,
+    temporary: PathBuf,
+    target: PathBuf,
+    done: bool,
 }
 
-#[cfg(test)]
+impl Replacement {
+    /// # Errors
+    /// [`ErrorKind::Io`] if `path` is there and is no regular file, or no file can be made beside it.
+    pub(crate) fn create(path: &Path) -> Result<Self> {
+        // A link stays one: its target is what gets replaced.
+        let target = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+        if fs::metadata(&target).is_ok_and(|m| !m.is_file()) {
+            return Err(Error::new(ErrorKind::Io, "cannot write: not a regular file").in_file(path));
+        }
+        let Some(name) = target.file_name() else {
+            return Err(Error::new(ErrorKind::Io, "cannot write: the path names no file").in_file(path));
+        };
+        static NEXT: AtomicU32 = AtomicU32::new(0);
+        loop {
+            let mut temporary = OsString::from(".");
+            temporary.push(name);
+            temporary.push(format!(".{}-{}.tmp", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed)));
+            let temporary = target.with_file_name(temporary);
+            match OpenOptions::new().write(true).create_new(true).open(&temporary) {
+                Ok(file) => return Ok(Self { file, temporary, target, done: false }),
+                // Left by a process of the same id that was killed: take the next number.
+                Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {}
+                Err(e) => return Err(Error::io(path, "write", &e)),
+            }
+        }
+    }
+
+    /// Gives the file its name once its bytes are on disk.
+    pub(crate) fn commit(mut self, path: &Path) -> Result<()> {
+        // The name must not reach the disk before the bytes.
+        self.file.sync_all().map_err(|e| Error::io(path, "write", &e))?;
+        fs::rename(&self.temporary, &self.target).map_err(|e| Error::io(path, "write", &e))?;
+        self.done = true;
+        Ok(())
+    }
+}
+
+impl Drop for Replacement {
+    fn drop(&mut self) {
+        if !self.done {
+            // Nothing is left to report to: the error that brought us here is on its way.
+            let _ = fs::remove_file(&self.temporary);
+        }
+    }
+}
+
+#[cfg(all(test, any(feature = "npz", feature = "images")))]
 mod tests {
     use super::*;
 
