@@ -12,7 +12,7 @@ use voxcast_kernels::deconv3d::{Deconv3d, deconv3d};
 use voxcast_kernels::deform_conv2d::{DeformConv2d, deform_conv2d};
 use voxcast_kernels::depthwise::{Depthwise, depthwise};
 use voxcast_kernels::gate::{Gate, gate};
-use voxcast_kernels::gather::{Gather, gather};
+use voxcast_kernels::gather::{Gather, Mask, gather};
 use voxcast_kernels::head::{Head, head};
 use voxcast_kernels::max_pool::{MaxPool, max_pool};
 use voxcast_kernels::normalise::normalise;
@@ -45,35 +45,46 @@ pub(crate) struct HeadOutput<'a> {
     pub(crate) logits: Option<&'a mut [f32]>,
 }
 
-/// What an operation needs that is not in the arena.
-pub(crate) struct Context<'a> {
+/// Everything but memory that operations need.
+pub(crate) struct Executor {
     pub(crate) isa: Isa,
-    pub(crate) graph: &'a Graph,
-    pub(crate) plan: &'a Plan,
+    pub(crate) graph: Graph,
+    pub(crate) plan: Plan,
     pub(crate) cameras: usize,
-    pub(crate) threads: &'a Threads,
-}
-
-/// One camera's image as the caller holds it: `height * width * 3` bytes, blue first.
-#[derive(Clone, Copy, Debug)]
-pub struct ImageView<'a> {
-    /// Rows.
-    pub height: usize,
-    /// Pixels of a row.
-    pub width: usize,
-    /// The pixels.
-    pub bgr: &'a [u8],
+    pub(crate) threads: Threads,
 }
 
 /// What changes from call to call of the same operation.
 pub(crate) struct Call<'a> {
     pub(crate) camera: usize,
-    pub(crate) image: Option<ImageView<'a>>,
+    /// The image of the camera whose pass this is.
+    pub(crate) image: Option<Image<'a>>,
     pub(crate) levels: &'a [Level<'a>; 3],
+    /// Cameras to leave out, if there are any.
+    pub(crate) masked: Option<&'a [bool]>,
     pub(crate) head: Option<HeadOutput<'a>>,
+    pub(crate) slice: Slice,
 }
 
-impl Context<'_> {
+/// A dense image, blue first.
+#[derive(Clone, Copy)]
+pub(crate) struct Image<'a> {
+    pub(crate) height: usize,
+    pub(crate) width: usize,
+    pub(crate) bgr: &'a [u8],
+}
+
+/// The part of an operation that a call runs: from tile `first`, one of about `parts` equal shares of the tiles.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Slice {
+    pub(crate) first: usize,
+    pub(crate) parts: usize,
+}
+
+/// The next tile of an operation, unless all have run.
+pub(crate) type Next = Option<usize>;
+
+impl Executor {
     /// Numbers of tensor `id` within the arena; those of camera `camera` where each has its own.
     fn range(&self, id: TensorId, camera: usize) -> Range<usize> {
         let tensor = self.graph.tensor(id);
@@ -95,7 +106,7 @@ impl Context<'_> {
         unsafe { view.read(self.range(operation.output, camera)) }
     }
 
-    /// Checks, once per session, what [`Context::run`] relies on: an operation writes only its output and its workers'
+    /// Checks, once per session, what [`Executor::run`] relies on: an operation writes only its output and its workers'
     /// scratch, and neither meets anything that it reads, but for what it overwrites in place.
     pub(crate) fn check(&self) -> Result<()> {
         let broken = |name: &str| Error::new(ErrorKind::Unsupported, format!("the plan breaks operation \"{name}\""));
@@ -135,8 +146,10 @@ impl Context<'_> {
             && self.plan.place(id) == self.plan.place(operation.output)
     }
 
-    /// Runs `operation` on the current pool. `weights` are its parts.
-    pub(crate) fn run(&self, view: View<'_>, operation: &Operation, weights: &[Panels<'_>], call: Call<'_>) {
+    /// Runs a slice of `operation` on the current pool. `weights` are its parts.
+    ///
+    /// Tiles are the same whatever the slices, and each runs once: slices cannot show in a result.
+    pub(crate) fn run(&self, view: View<'_>, operation: &Operation, weights: &[Panels<'_>], call: Call<'_>) -> Next {
         // SAFETY: `check` found the inputs apart from everything that this operation writes.
         let input = |i: usize| unsafe { view.read(self.range(operation.inputs[i], call.camera)) };
         match &operation.op {
@@ -144,16 +157,16 @@ impl Context<'_> {
             Op::Conv { geometry } => {
                 let product = self.product(view, operation, weights, geometry.depth(), call.camera);
                 let args = Conv { geometry: *geometry, input: input(0), product };
-                self.rows(view, operation, geometry, call.camera, &|rows, stride, out, scratch| {
+                self.rows(view, operation, geometry, &call, &|rows, stride, out, scratch| {
                     conv(self.isa, &args, rows, stride, out, scratch);
-                });
+                })
             }
             Op::DeformConv { geometry } => {
                 let product = self.product(view, operation, weights, geometry.depth(), call.camera);
                 let args = DeformConv2d { geometry: *geometry, input: input(0), offsets: input(1), product };
-                self.rows(view, operation, geometry, call.camera, &|rows, stride, out, scratch| {
+                self.rows(view, operation, geometry, &call, &|rows, stride, out, scratch| {
                     deform_conv2d(self.isa, &args, rows, stride, out, scratch);
-                });
+                })
             }
             Op::Depthwise { side } => {
                 let [_, height, width] = self.graph.tensor(operation.output).extent;
@@ -167,9 +180,9 @@ impl Context<'_> {
                     bias: plain(weights, 1),
                     residual: operation.residual.is_some(),
                 };
-                self.lines(view, operation, call.camera, height, &|rows, out, _| depthwise(self.isa, &args, rows, out));
+                self.lines(view, operation, &call, height, &|rows, out, _| depthwise(self.isa, &args, rows, out))
             }
-            Op::BatchNorm => self.batch_norm(view, operation, weights, call.camera),
+            Op::BatchNorm => self.batch_norm(view, operation, weights, &call),
             Op::MaxPool { side, stride, padding } => {
                 let [_, height, width] = self.graph.tensor(operation.inputs[0]).extent;
                 let args = MaxPool {
@@ -182,25 +195,26 @@ impl Context<'_> {
                     padding: *padding,
                 };
                 let lines = args.output()[0];
-                self.lines(view, operation, call.camera, lines, &|rows, out, _| max_pool(self.isa, &args, rows, out));
+                self.lines(view, operation, &call, lines, &|rows, out, _| max_pool(self.isa, &args, rows, out))
             }
             Op::UpsampleAdd => {
                 let [_, height, width] = self.graph.tensor(operation.output).extent;
                 let [_, low_height, low_width] = self.graph.tensor(operation.inputs[1]).extent;
                 let args =
                     UpsampleAdd { low: input(1), low_height, low_width, height, width, channels: operation.channels };
-                self.lines(view, operation, call.camera, height, &|rows, out, _| {
+                self.lines(view, operation, &call, height, &|rows, out, _| {
                     upsample_add(self.isa, &args, rows, out);
-                });
+                })
             }
             Op::Gather { level, matrix, first_channel, .. } => {
-                let Level { volume, bev } = call.levels[*level];
-                let Csr { ptr, col } = if *matrix == Matrix::Volume { volume } else { bev };
+                let Csr { ptr, col } = csr(call.levels, *level, *matrix);
                 // SAFETY: as for `input`.
                 let features = unsafe { view.read(self.whole_range(operation.inputs[0])) };
+                let pixels = self.graph.tensor(operation.inputs[0]).rows();
                 let args = Gather {
                     ptr,
                     col,
+                    mask: call.masked.map(|masked| Mask { pixels, masked }),
                     features,
                     stride: self.graph.tensor(operation.inputs[0]).channels,
                     first_channel: *first_channel,
@@ -208,9 +222,9 @@ impl Context<'_> {
                     bias: weights.first().map(|_| plain(weights, 0)),
                     relu: operation.relu,
                 };
-                self.chunks(view, operation, call.camera, GATHER_ROWS, &|rows, out, _| {
+                self.chunks(view, operation, &call, GATHER_ROWS, &|rows, out, _| {
                     gather(self.isa, &args, rows, out);
-                });
+                })
             }
             Op::Deconv => {
                 let x = self.graph.tensor(operation.inputs[0]);
@@ -229,9 +243,9 @@ impl Context<'_> {
                     add,
                 };
                 let planes = 2 * x.extent[0];
-                self.lines(view, operation, call.camera, planes, &|planes, out, scratch| {
+                self.lines(view, operation, &call, planes, &|planes, out, scratch| {
                     deconv3d(self.isa, &args, planes, out, scratch);
-                });
+                })
             }
             Op::WindowAttention { shape } => {
                 let args = WindowAttention {
@@ -246,15 +260,15 @@ impl Context<'_> {
                     proj_bias: plain(weights, 6),
                 };
                 let step = shape.window()[0] * shape.extent[1] * shape.channels;
-                self.pieces(view, operation, call.camera, step, &|row, out, scratch| {
+                self.pieces(view, operation, &call, step, &|row, out, scratch| {
                     window_attention(self.isa, &args, row, out, scratch);
-                });
+                })
             }
             Op::Gate => {
                 let depth = self.graph.tensor(operation.output).extent[2];
                 let bev = input(1);
                 let step = GATHER_ROWS.div_ceil(depth) * operation.channels;
-                self.pieces(view, operation, call.camera, step * depth, &|index, out, _| {
+                self.pieces(view, operation, &call, step * depth, &|index, out, _| {
                     let args = Gate {
                         bev: &bev[index * step..index * step + out.len() / depth],
                         depth,
@@ -263,39 +277,39 @@ impl Context<'_> {
                         bias: plain(weights, 1)[0],
                     };
                     gate(self.isa, &args, out);
-                });
+                })
             }
             Op::GlobalMean => {
                 let args = Mean { input: input(0), channels: operation.channels };
-                self.pieces(view, operation, call.camera, operation.channels, &|_, out, _| mean(self.isa, &args, out));
+                self.pieces(view, operation, &call, operation.channels, &|_, out, _| mean(self.isa, &args, out))
             }
             Op::Broadcast => {
                 let stride = self.graph.tensor(operation.output).channels;
-                self.pieces(view, operation, call.camera, GATHER_ROWS * stride, &|_, out, _| {
+                self.pieces(view, operation, &call, GATHER_ROWS * stride, &|_, out, _| {
                     broadcast(input(0), stride, operation.first_channel, out);
-                });
+                })
             }
-            Op::Head { .. } => self.head(view, operation, weights, input(0), call.head),
+            Op::Head { .. } => self.head(view, operation, weights, input(0), call),
         }
     }
 
-    fn normalise(&self, view: View<'_>, operation: &Operation, call: &Call<'_>) {
+    fn normalise(&self, view: View<'_>, operation: &Operation, call: &Call<'_>) -> Next {
         let [_, height, width] = self.graph.tensor(operation.output).extent;
-        let ImageView { height: image_height, width: image_width, bgr } =
+        let Image { height: image_height, width: image_width, bgr } =
             call.image.expect("the pass of a camera has its image");
-        self.lines(view, operation, call.camera, height, &|rows, out, _| {
+        self.lines(view, operation, call, height, &|rows, out, _| {
             normalise(bgr, image_height, image_width, width, rows.start, out);
-        });
+        })
     }
 
-    fn batch_norm(&self, view: View<'_>, operation: &Operation, weights: &[Panels<'_>], camera: usize) {
+    fn batch_norm(&self, view: View<'_>, operation: &Operation, weights: &[Panels<'_>], call: &Call<'_>) -> Next {
         let tensor = self.graph.tensor(operation.output);
         let residual = operation.residual.map(|r| {
             // SAFETY: `check` found the residual apart from the output.
-            (unsafe { view.read(self.range(r.tensor, camera)) }, r.after)
+            (unsafe { view.read(self.range(r.tensor, call.camera)) }, r.after)
         });
         let step = GATHER_ROWS * tensor.channels;
-        self.pieces(view, operation, camera, step, &|index, out, _| {
+        self.pieces(view, operation, call, step, &|index, out, _| {
             let args = ScaleShift {
                 scale: plain(weights, 0),
                 shift: plain(weights, 1),
@@ -307,7 +321,7 @@ impl Context<'_> {
                 relu: operation.relu,
             };
             scale_shift(self.isa, &args, out);
-        });
+        })
     }
 
     fn head(
@@ -316,9 +330,9 @@ impl Context<'_> {
         operation: &Operation,
         weights: &[Panels<'_>],
         input: &[f32],
-        output: Option<HeadOutput<'_>>,
-    ) {
-        let HeadOutput { classes, logits } = output.expect("a head is given room for its result");
+        call: Call<'_>,
+    ) -> Next {
+        let HeadOutput { classes, logits } = call.head.expect("a head is given room for its result");
         let args = Head {
             input,
             channels: self.graph.tensor(operation.inputs[0]).channels,
@@ -329,7 +343,7 @@ impl Context<'_> {
         let rows = classes.len();
         let classes = Shared::new(classes);
         let logits = logits.map(Shared::new);
-        self.threads.for_each_tile(self.plan.workers(), rows.div_ceil(HEAD_ROWS), &|worker, tile| {
+        self.tiles(call.slice, rows.div_ceil(HEAD_ROWS), &|worker, tile| {
             let rows = tile * HEAD_ROWS..rows.min((tile + 1) * HEAD_ROWS);
             // SAFETY: each tile has its own rows, and each worker its own scratch.
             let (classes, logits, scratch) = unsafe {
@@ -337,7 +351,7 @@ impl Context<'_> {
                 (classes.part(rows.clone()), logits, view.write(self.plan.scratch(worker)))
             };
             head(self.isa, &args, rows, classes, logits, scratch);
-        });
+        })
     }
 
     /// The right matrix of a convolution, with the residual as the kernel takes it.
@@ -370,52 +384,95 @@ impl Context<'_> {
     }
 
     /// Cuts a convolution's rows into tiles. The output may be some channels of a wider tensor.
-    fn rows(&self, view: View<'_>, operation: &Operation, geometry: &Geometry, camera: usize, kernel: &RowsKernel<'_>) {
+    fn rows(
+        &self,
+        view: View<'_>,
+        operation: &Operation,
+        geometry: &Geometry,
+        call: &Call<'_>,
+        kernel: &RowsKernel<'_>,
+    ) -> Next {
         let stride = self.graph.tensor(operation.output).channels;
-        let start = self.range(operation.output, camera).start + operation.first_channel;
+        let start = self.range(operation.output, call.camera).start + operation.first_channel;
         let rows = geometry.rows();
         // As many tiles as blocks of rows, but the same number for every worker.
         let tiles = rows.div_ceil(CONV_ROWS).next_multiple_of(self.plan.workers());
         let per_tile = rows.div_ceil(tiles).next_multiple_of(CONV_TILE);
-        self.threads.for_each_tile(self.plan.workers(), rows.div_ceil(per_tile), &|worker, tile| {
+        self.tiles(call.slice, rows.div_ceil(per_tile), &|worker, tile| {
             let rows = tile * per_tile..rows.min((tile + 1) * per_tile);
             let place = start + rows.start * stride..start + (rows.end - 1) * stride + operation.channels;
             // SAFETY: each tile has its own rows, and each worker its own scratch; `check` found both apart from
             // everything that is read.
             let (out, scratch) = unsafe { (view.write(place), view.write(self.plan.scratch(worker))) };
             kernel(rows, stride, out, scratch);
-        });
+        })
     }
 
     /// Gives each worker a few of `lines` equal lines of the output: image rows or volume planes.
-    fn lines(&self, view: View<'_>, operation: &Operation, camera: usize, lines: usize, kernel: &LinesKernel<'_>) {
-        let line = self.range(operation.output, camera).len() / lines;
+    fn lines(
+        &self,
+        view: View<'_>,
+        operation: &Operation,
+        call: &Call<'_>,
+        lines: usize,
+        kernel: &LinesKernel<'_>,
+    ) -> Next {
+        let line = self.range(operation.output, call.camera).len() / lines;
         let per_tile = lines.div_ceil(8 * self.plan.workers()).max(1);
-        self.pieces(view, operation, camera, per_tile * line, &|tile, out, scratch| {
+        self.pieces(view, operation, call, per_tile * line, &|tile, out, scratch| {
             let first = tile * per_tile;
             kernel(first..first + out.len() / line, out, scratch);
-        });
+        })
     }
 
     /// Gives each worker up to `rows` positions of the output at a time.
-    fn chunks(&self, view: View<'_>, operation: &Operation, camera: usize, rows: usize, kernel: &LinesKernel<'_>) {
-        self.pieces(view, operation, camera, rows * operation.channels, &|tile, out, scratch| {
+    fn chunks(
+        &self,
+        view: View<'_>,
+        operation: &Operation,
+        call: &Call<'_>,
+        rows: usize,
+        kernel: &LinesKernel<'_>,
+    ) -> Next {
+        self.pieces(view, operation, call, rows * operation.channels, &|tile, out, scratch| {
             let first = tile * rows;
             kernel(first..first + out.len() / operation.channels, out, scratch);
-        });
+        })
     }
 
     /// Cuts the output into pieces of `len` numbers.
-    fn pieces(&self, view: View<'_>, operation: &Operation, camera: usize, len: usize, kernel: &PieceKernel<'_>) {
-        let Range { start, end } = self.range(operation.output, camera);
-        self.threads.for_each_tile(self.plan.workers(), (end - start).div_ceil(len), &|worker, tile| {
+    fn pieces(
+        &self,
+        view: View<'_>,
+        operation: &Operation,
+        call: &Call<'_>,
+        len: usize,
+        kernel: &PieceKernel<'_>,
+    ) -> Next {
+        let Range { start, end } = self.range(operation.output, call.camera);
+        self.tiles(call.slice, (end - start).div_ceil(len), &|worker, tile| {
             let place = start + tile * len..end.min(start + (tile + 1) * len);
             // SAFETY: each tile has its own piece, and each worker its own scratch; `check` found both apart from
             // everything that is read.
             let (out, scratch) = unsafe { (view.write(place), view.write(self.plan.scratch(worker))) };
             kernel(tile, out, scratch);
-        });
+        })
     }
+
+    /// Runs the slice's share of `count` tiles.
+    fn tiles(&self, slice: Slice, count: usize, tile: &(dyn Fn(usize, usize) + Sync)) -> Next {
+        let workers = self.plan.workers();
+        let share = count.div_ceil(slice.parts).next_multiple_of(workers);
+        let end = count.min(slice.first.saturating_add(share));
+        self.threads.for_each_tile(workers, end - slice.first, &|worker, index| tile(worker, slice.first + index));
+        (end < count).then_some(end)
+    }
+}
+
+/// The matrix of a gather.
+pub(crate) fn csr<'a>(levels: &[Level<'a>; 3], level: usize, matrix: Matrix) -> Csr<'a> {
+    let Level { volume, bev } = levels[level];
+    if matrix == Matrix::Volume { volume } else { bev }
 }
 
 /// A part that is stored in f32 whatever the model's precision.

@@ -34,8 +34,7 @@
 //! let mut session = Session::new(model, rig, &options)?;
 //!
 //! // Every frame. If the calibration moves, build another rig and pass it to `Session::set_rig`.
-//! let images: Vec<ImageView> =
-//!     cameras.iter().map(|bgr| ImageView { height: 900, width: 1600, bgr }).collect();
+//! let images: Vec<ImageView> = cameras.iter().map(|bgr| ImageView::bgr(900, 1600, bgr)).collect();
 //! let occupancy = session.run(&images)?;
 //! let [_, y, z] = occupancy.grid;
 //! let class = occupancy.classes[(10 * y + 20) * z + 3]; // voxel (10, 20, 3); 0 is empty
@@ -110,6 +109,8 @@ pub mod demo;
 pub mod error;
 mod exec;
 pub mod graph;
+mod heap;
+pub mod image;
 pub mod import;
 pub mod model;
 pub mod network;
@@ -128,11 +129,12 @@ pub mod threads;
 pub mod weights;
 
 pub use error::{Error, ErrorKind, Result};
+pub use image::ImageView;
 pub use model::Model;
 pub use network::Network;
 pub use rig::Rig;
 pub use scene::Scene;
-pub use session::{ImageView, Occupancy, Session, SessionOptions};
+pub use session::{Budget, Occupancy, Session, SessionOptions, Step};
 pub use threads::Threads;
 pub use voxcast_kernels::{Isa, IsaError};
 

@@ -6,6 +6,7 @@
 
 use crate::error::{Error, ErrorKind, Result};
 use crate::graph::{Graph, Op, Scope, TensorId};
+use crate::heap;
 use std::fmt;
 use std::ops::Range;
 use voxcast_kernels::{LANES, head, product};
@@ -116,6 +117,12 @@ impl Plan {
     /// Bytes of the arena.
     pub fn bytes(&self) -> usize {
         self.len * size_of::<f32>()
+    }
+
+    /// Bytes that the plan itself holds beside its own.
+    pub(crate) fn heap_bytes(&self) -> usize {
+        let names: usize = self.lines.iter().map(|line| line.name.capacity()).sum();
+        heap::vector(&self.places) + heap::vector(&self.scratch) + heap::vector(&self.lines) + names
     }
 }
 

@@ -1,19 +1,36 @@
 //! A session: model, rig and arena, ready to run frames.
 
+mod camera;
+mod frame;
+mod memory;
+mod output;
+#[cfg(test)]
+mod tests;
+
+pub use camera::CameraStatus;
+pub use frame::{Budget, Step};
+pub use memory::Memory;
+pub use output::Occupancy;
+
 use crate::arena::Arena;
 use crate::error::{Error, ErrorKind, Result};
-pub use crate::exec::ImageView;
-use crate::exec::{Call, Context, HeadOutput};
-use crate::graph::{Graph, Op, Operation, Scope};
+use crate::exec::Executor;
+use crate::graph::{Graph, Operation};
+use crate::heap;
+use crate::image::ImageView;
 use crate::model::{Model, PartRef};
 use crate::network::Network;
 use crate::plan::Plan;
 use crate::rig::{Csr, Level, Rig};
 use crate::scene::Scene;
 use crate::threads::Threads;
+use camera::Camera;
+use frame::Frame;
+use memory::{Lengths, Tables};
+use output::{Output, zeros};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
-use voxcast_kernels::{Isa, Panels};
+use std::time::Duration;
+use voxcast_kernels::Isa;
 
 /// How a session runs. None of it can change a result but `unfolded`, which changes rounding.
 #[derive(Clone, Debug)]
@@ -28,23 +45,22 @@ pub struct SessionOptions {
     pub logits: bool,
     /// Also run the heads of levels 1 to 3, for whoever observes their stages.
     pub coarse_heads: bool,
+    /// Work in one slice of [`Session::step`], in multiply-adds; a number that moves counts as 20. A slice is at least one
+    /// tile of an operation for every thread, so that slices of large networks may be longer.
+    pub slice_cost: u64,
 }
 
 impl Default for SessionOptions {
     fn default() -> Self {
-        Self { isa: Isa::best(), threads: Threads::calling(), unfolded: false, logits: false, coarse_heads: false }
+        Self {
+            isa: Isa::best(),
+            threads: Threads::calling(),
+            unfolded: false,
+            logits: false,
+            coarse_heads: false,
+            slice_cost: 100_000_000,
+        }
     }
-}
-
-/// The result of a frame.
-#[derive(Clone, Copy, Debug)]
-pub struct Occupancy<'a> {
-    /// Voxels along x, y, z.
-    pub grid: [usize; 3],
-    /// Class of each voxel, `[x, y, z]`, z fastest; 0 is empty.
-    pub classes: &'a [u8],
-    /// `[x, y, z, classes]`, if the session keeps them.
-    pub logits: Option<&'a [f32]>,
 }
 
 /// What an observer is told after each operation.
@@ -54,88 +70,56 @@ pub struct Event<'a> {
     pub operation: &'a Operation,
     /// Its camera, if it runs per camera.
     pub camera: Option<usize>,
-    /// Wall time.
+    /// Wall time of all its slices.
     pub elapsed: Duration,
+    /// Wall time of the longest slice.
+    pub longest: Duration,
     /// What it wrote: the tensor, or a head's logits.
     pub output: &'a [f32],
 }
 
-/// Everything that a session takes from the system, known before it is made.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Memory {
-    /// The arena: tensors and every worker's scratch.
-    pub arena: usize,
-    /// Classes, and logits where they are kept or observed.
-    pub output: usize,
-}
-
-impl Memory {
-    /// Bytes in all.
-    pub fn total(&self) -> usize {
-        self.arena + self.output
-    }
-}
-
-/// A model with memory to run in. Frames after the first allocate nothing.
+/// A model with memory to run in. Nothing is allocated after [`Session::new`].
+///
+/// [`Session::run`] computes a frame at once. A controller that gets its images one by one, or has little time at a time,
+/// calls [`Session::set_camera`] and [`Session::step`]: only cameras with a new image go through the backbone again, and
+/// the work is done in slices. Both ways give the same bits.
 pub struct Session {
     model: Arc<Model>,
     rig: Arc<Rig>,
-    graph: Graph,
-    plan: Plan,
-    /// Part names resolved once: for each operation, where its weights lie in the model.
+    executor: Executor,
+    /// For each operation, where its weights lie in the model.
     weights: Vec<Vec<PartRef>>,
     arena: Arena,
-    isa: Isa,
-    threads: Threads,
-    cameras: usize,
-    classes: Vec<u8>,
-    coarse_classes: Vec<u8>,
-    logits: Vec<f32>,
     keep_logits: bool,
+    slice_cost: u64,
+    cameras: Vec<Camera>,
+    /// Cameras that are left out.
+    masked: Vec<bool>,
+    /// Counts the changes of rig and mask.
+    sight: u64,
+    frame: Frame,
+    /// The last complete result.
+    front: Output,
+    /// The result that is being written.
+    back: Output,
+    coarse_classes: Vec<u8>,
 }
 
 impl std::fmt::Debug for Session {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Session").field("isa", &self.isa).field("threads", &self.threads).finish_non_exhaustive()
+        let Executor { isa, threads, .. } = &self.executor;
+        f.debug_struct("Session").field("isa", isa).field("threads", threads).finish_non_exhaustive()
     }
-}
-
-/// Length of the largest head's logits, 0 if they are not kept.
-fn logits_len(graph: &Graph, options: &SessionOptions) -> usize {
-    if !(options.logits || options.coarse_heads) {
-        return 0;
-    }
-    heads(graph).map(|o| graph.tensor(o.output).len()).max().unwrap_or(0)
-}
-
-/// Voxels of the largest coarse head, 0 if there is none.
-fn coarse_len(graph: &Graph) -> usize {
-    let coarse = heads(graph).filter(|o| o.op != Op::Head { level: 0 });
-    coarse.map(|o| graph.tensor(o.output).rows()).max().unwrap_or(0)
-}
-
-/// `len` zeros, unless the system has no memory for them.
-fn zeros<T: Clone + Default>(len: usize) -> Option<Vec<T>> {
-    let mut zeros = Vec::new();
-    zeros.try_reserve_exact(len).ok()?;
-    zeros.resize(len, T::default());
-    Some(zeros)
-}
-
-fn heads(graph: &Graph) -> impl Iterator<Item = &Operation> {
-    graph.operations.iter().filter(|o| matches!(o.op, Op::Head { .. }))
 }
 
 impl Session {
-    /// What [`Session::new`] will take from the system for `cameras` cameras.
+    /// What [`Session::new`] will take from the system for `cameras` cameras, to the byte.
     ///
     /// # Errors
     /// [`ErrorKind::TooLarge`] if it cannot be addressed.
     pub fn memory(model: &Model, cameras: usize, options: &SessionOptions) -> Result<Memory> {
-        let graph = model.graph(options.unfolded, options.coarse_heads);
-        let plan = Plan::new(&graph, cameras, options.threads.count())?;
-        let voxels: usize = model.network().output_grid().iter().product();
-        Ok(Memory { arena: plan.bytes(), output: voxels + coarse_len(&graph) + 4 * logits_len(&graph, options) })
+        let tables = Tables::new(model, cameras, options)?;
+        Lengths::new(&tables.graph, options).memory(&tables, cameras)
     }
 
     /// Plans and allocates. The rig may be swapped later.
@@ -143,68 +127,155 @@ impl Session {
     /// # Errors
     /// [`ErrorKind::Mismatch`] if the rig is not this network's; [`ErrorKind::TooLarge`] if there is not enough memory.
     pub fn new(model: Arc<Model>, rig: Arc<Rig>, options: &SessionOptions) -> Result<Self> {
-        let graph = model.graph(options.unfolded, options.coarse_heads);
-        let cameras = rig.cameras();
-        check_rig(&rig, model.network(), cameras)?;
-        let plan = Plan::new(&graph, cameras, options.threads.count())?;
-        let too_large = |bytes: usize| {
-            Error::new(ErrorKind::TooLarge, format!("the system has no {bytes} bytes for the session's arena"))
-        };
-        let weights = graph.operations.iter().map(|o| model.part_refs(&graph, o)).collect::<Result<_>>()?;
-        let arena = Arena::new(plan.len()).ok_or_else(|| too_large(plan.bytes()))?;
-        let voxels: usize = model.network().output_grid().iter().product();
-        let output = || Error::new(ErrorKind::TooLarge, "the system has no memory for the session's output");
+        let count = rig.cameras();
+        check_rig(&rig, model.network(), count)?;
+        let tables = Tables::new(&model, count, options)?;
+        let lengths = Lengths::new(&tables.graph, options);
+        let Memory { arena: bytes, .. } = lengths.memory(&tables, count)?;
+        let Tables { graph, plan, weights } = tables;
+        let no_arena =
+            || Error::new(ErrorKind::TooLarge, format!("the system has no {bytes} bytes for the session's arena"));
+        let no_memory =
+            || Error::new(ErrorKind::TooLarge, "the system has no memory for the session's images and results");
+        let arena = Arena::new(plan.len()).ok_or_else(no_arena)?;
+        let mut cameras = Vec::new();
+        cameras.try_reserve_exact(count).map_err(|_| no_memory())?;
+        for _ in 0..count {
+            cameras.push(Camera::new(zeros(lengths.image).ok_or_else(no_memory)?));
+        }
+        let output = || Output::new(lengths.voxels, lengths.logits, count).ok_or_else(no_memory);
         let session = Self {
-            weights,
             arena,
-            isa: options.isa,
-            threads: options.threads.clone(),
-            cameras,
-            classes: zeros(voxels).ok_or_else(output)?,
-            coarse_classes: zeros(coarse_len(&graph)).ok_or_else(output)?,
-            logits: zeros(logits_len(&graph, options)).ok_or_else(output)?,
+            executor: Executor { isa: options.isa, graph, plan, cameras: count, threads: options.threads.clone() },
             keep_logits: options.logits,
+            slice_cost: options.slice_cost.max(1),
+            masked: zeros(count).ok_or_else(no_memory)?,
+            sight: 1,
+            frame: Frame::default(),
+            front: output()?,
+            back: output()?,
+            coarse_classes: zeros(lengths.coarse).ok_or_else(no_memory)?,
+            cameras,
+            weights,
             model,
             rig,
-            graph,
-            plan,
         };
-        session.context().check()?;
+        session.executor.check()?;
         Ok(session)
+    }
+
+    /// The model.
+    pub fn model(&self) -> &Arc<Model> {
+        &self.model
     }
 
     /// Operations, for whoever reports on them.
     pub fn graph(&self) -> &Graph {
-        &self.graph
+        &self.executor.graph
     }
 
     /// Where everything lies.
     pub fn plan(&self) -> &Plan {
-        &self.plan
+        &self.executor.plan
     }
 
     /// What the session took, as [`Session::memory`] said it would.
     pub fn taken(&self) -> Memory {
-        let arena = self.arena.bytes();
-        Memory { arena, output: self.classes.len() + self.coarse_classes.len() + 4 * self.logits.len() }
+        let weights: usize = self.weights.iter().map(heap::vector).sum();
+        Memory {
+            arena: self.arena.bytes(),
+            images: heap::vector(&self.cameras)
+                + heap::vector(&self.masked)
+                + self.cameras.iter().map(Camera::bytes).sum::<usize>(),
+            output: self.front.bytes() + self.back.bytes() + heap::vector(&self.coarse_classes),
+            tables: heap::graph(&self.executor.graph)
+                + self.executor.plan.heap_bytes()
+                + heap::vector(&self.weights)
+                + weights,
+        }
     }
 
     /// Cameras of a frame.
     pub fn cameras(&self) -> usize {
-        self.cameras
+        self.cameras.len()
     }
 
-    /// Uses another rig of the same network and number of cameras from the next frame on.
+    /// Uses another rig of the same network and number of cameras, and gives the one in use back: a caller who keeps it
+    /// can have the next calibration built into its memory ([`RigBuilder::rebuild`](crate::rig::RigBuilder::rebuild)).
+    /// Allocates and frees nothing.
+    ///
+    /// It takes effect at once. A frame whose fusion is under way fuses again from the start; no backbone runs again.
     ///
     /// # Errors
-    /// [`ErrorKind::Mismatch`] if it is not.
-    pub fn set_rig(&mut self, rig: Arc<Rig>) -> Result<()> {
-        check_rig(&rig, self.model.network(), self.cameras)?;
-        self.rig = rig;
+    /// [`ErrorKind::Mismatch`] if the rig does not fit; the one in use stays.
+    pub fn set_rig(&mut self, rig: Arc<Rig>) -> Result<Arc<Rig>> {
+        check_rig(&rig, self.model.network(), self.cameras.len())?;
+        let replaced = std::mem::replace(&mut self.rig, rig);
+        self.sight_changed();
+        Ok(replaced)
+    }
+
+    /// Leaves camera `camera` out, or takes it in again: the means are over the pixels of the others, with the bits of a
+    /// rig without its entries. A camera that has failed or is dirty need not have an image, and its backbone does not run.
+    ///
+    /// It takes effect at once, as [`Session::set_rig`] does. A camera that is taken in again shows its latest image.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Mismatch`] if there is no such camera.
+    pub fn set_masked(&mut self, camera: usize, masked: bool) -> Result<()> {
+        self.check_camera(camera)?;
+        if std::mem::replace(&mut self.masked[camera], masked) != masked {
+            self.frame.leave(camera, &mut self.cameras[camera]);
+            self.sight_changed();
+        }
         Ok(())
     }
 
-    /// Runs one frame.
+    /// Copies camera `camera`'s next image, whose pass [`Session::step`] will run. Where the image before has not begun
+    /// its pass, it is replaced.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Mismatch`] if there is no such camera, or the image's size is not the network's.
+    pub fn set_camera(&mut self, camera: usize, image: ImageView<'_>) -> Result<()> {
+        self.check_camera(camera)?;
+        image.check(camera, self.model.network().image)?;
+        self.cameras[camera].receive(&image);
+        self.frame.received(camera);
+        Ok(())
+    }
+
+    /// Does some of what is to be done: passes of the cameras that have a new image, then the fusion of all features. At
+    /// least one slice runs, unless there is nothing to do. See [`Budget`] and [`Step`].
+    ///
+    /// A camera's pass runs once per frame at most, so that images that come quickly cannot hold up the result.
+    ///
+    /// # Determinism
+    /// Results do not depend on how the work is cut, nor on the order in which images came.
+    pub fn step(&mut self, budget: Budget) -> Step {
+        self.step_observed(budget, &mut |_| ())
+    }
+
+    /// [`Session::step`] that tells `observer` of each operation as it ends.
+    pub fn step_observed(&mut self, budget: Budget, observer: &mut (dyn FnMut(Event<'_>) + Send)) -> Step {
+        let threads = self.executor.threads.clone();
+        threads.enter(|| self.advance(budget, observer))
+    }
+
+    /// The last complete result; none before the first frame. It stays as it is while [`Session::step`] works on the next.
+    pub fn occupancy(&self) -> Option<Occupancy<'_>> {
+        let Output { classes, logits, support, cameras, .. } = &self.front;
+        let logits = self.keep_logits.then_some(&logits[..]);
+        let grid = self.model.network().output_grid();
+        self.frame.any_complete().then_some(Occupancy { grid, classes, logits, support, cameras })
+    }
+
+    /// The longest time that one slice took so far, and the operation that it was a part of. Slices of [`Session::run`]
+    /// are whole operations and do not count.
+    pub fn longest_slice(&self) -> Option<(Duration, &Operation)> {
+        self.frame.longest().map(|(time, index)| (time, &self.executor.graph.operations[index]))
+    }
+
+    /// Runs one frame: every camera gets a new image, and all is computed. What [`Session::step`] had begun is dropped.
     ///
     /// # Errors
     /// [`ErrorKind::Mismatch`] if the number of images or an image's size is not the network's.
@@ -233,101 +304,38 @@ impl Session {
         images: &[ImageView<'_>],
         observer: &mut (dyn FnMut(Event<'_>) + Send),
     ) -> Result<Occupancy<'_>> {
-        self.check_images(images)?;
-        let threads = self.threads.clone();
-        threads.enter(|| self.frame(images, observer));
-        let logits = self.keep_logits.then_some(&self.logits[..]);
-        Ok(Occupancy { grid: self.model.network().output_grid(), classes: &self.classes, logits })
+        let count = self.cameras.len();
+        if images.len() != count {
+            return Err(Error::mismatch(format!("{} images, the rig has {count} cameras", images.len())));
+        }
+        for (camera, image) in images.iter().enumerate() {
+            image.check(camera, self.model.network().image)?;
+        }
+        self.frame.restart(&mut self.cameras);
+        for (camera, image) in self.cameras.iter_mut().zip(images) {
+            camera.receive(image);
+        }
+        let step = self.step_observed(Budget::Unlimited, observer);
+        debug_assert_eq!(step, Step::Complete, "every camera has a new image");
+        Ok(self.occupancy().expect("a complete frame"))
     }
 
-    fn check_images(&self, images: &[ImageView<'_>]) -> Result<()> {
-        let expected = self.model.network().image;
-        if images.len() != self.cameras {
-            return Err(Error::mismatch(format!("{} images, the rig has {} cameras", images.len(), self.cameras)));
-        }
-        for (i, image) in images.iter().enumerate() {
-            let padded = [image.height, image.width].map(|v| v.checked_next_multiple_of(32).unwrap_or(0));
-            // The product is only taken of a size that pads to the network's, which is small.
-            if padded != expected || image.bgr.len() != image.height * image.width * 3 {
-                return Err(Error::mismatch(format!(
-                    "image {i}: {} bytes for {}x{} (height x width), the network expects a size that pads to {}x{}",
-                    image.bgr.len(),
-                    image.height,
-                    image.width,
-                    expected[0],
-                    expected[1]
-                )));
-            }
+    fn check_camera(&self, camera: usize) -> Result<()> {
+        if camera >= self.cameras.len() {
+            return Err(Error::mismatch(format!("camera {camera}, the rig has {} cameras", self.cameras.len())));
         }
         Ok(())
     }
 
-    fn context(&self) -> Context<'_> {
-        Context { isa: self.isa, graph: &self.graph, plan: &self.plan, cameras: self.cameras, threads: &self.threads }
-    }
-
-    fn frame(&mut self, images: &[ImageView<'_>], observer: &mut dyn FnMut(Event<'_>)) {
-        let (passes, frame) =
-            (0..self.graph.camera_operations, self.graph.camera_operations..self.graph.operations.len());
-        for (camera, image) in images.iter().enumerate() {
-            for index in passes.clone() {
-                self.operation(index, camera, Some(*image), observer);
-            }
-        }
-        for index in frame {
-            self.operation(index, 0, None, observer);
-        }
-    }
-
-    /// Runs operation `index` and tells the observer.
-    fn operation(
-        &mut self,
-        index: usize,
-        camera: usize,
-        image: Option<ImageView<'_>>,
-        observer: &mut dyn FnMut(Event<'_>),
-    ) {
-        let start = Instant::now();
-        let context = Context {
-            isa: self.isa,
-            graph: &self.graph,
-            plan: &self.plan,
-            cameras: self.cameras,
-            threads: &self.threads,
-        };
-        let operation = &self.graph.operations[index];
-        let levels = [0, 1, 2].map(|i| self.rig.level(i));
-        let mut parts = [Panels::F32(&[]); crate::weights::MAX_PARTS];
-        for (panels, part) in parts.iter_mut().zip(&self.weights[index]) {
-            *panels = self.model.resolve(part);
-        }
-        let view = self.arena.view();
-        let tensor = self.graph.tensor(operation.output);
-        let wanted = !self.logits.is_empty();
-        let head = match operation.op {
-            Op::Head { level } => Some(HeadOutput {
-                classes: if level == 0 { &mut self.classes } else { &mut self.coarse_classes[..tensor.rows()] },
-                logits: wanted.then(|| &mut self.logits[..tensor.len()]),
-            }),
-            _ => None,
-        };
-        let weights = &parts[..self.weights[index].len()];
-        context.run(view, operation, weights, Call { camera, image, levels: &levels, head });
-        let elapsed = start.elapsed();
-        let output = match operation.op {
-            Op::Head { .. } if wanted => &self.logits[..tensor.len()],
-            Op::Head { .. } => &[],
-            _ => context.output(view, operation, camera),
-        };
-        let camera = (index < self.graph.camera_operations).then_some(camera);
-        debug_assert!(camera.is_some() || tensor.scope == Scope::Frame);
-        observer(Event { operation, camera, elapsed, output });
+    fn sight_changed(&mut self) {
+        self.sight += 1;
+        self.frame.sight_changed();
     }
 }
 
 /// A scene's images as a session takes them.
 pub fn views(scene: &Scene) -> Vec<ImageView<'_>> {
-    scene.images.iter().map(|i| ImageView { height: i.height, width: i.width, bgr: &i.bgr }).collect()
+    scene.images.iter().map(|i| ImageView::bgr(i.height, i.width, &i.bgr)).collect()
 }
 
 /// Refuses a rig whose matrices do not fit the network.
@@ -359,6 +367,3 @@ fn check_rig(rig: &Rig, network: &Network, cameras: usize) -> Result<()> {
     }
     Ok(())
 }
-
-#[cfg(test)]
-mod tests;

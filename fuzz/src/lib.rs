@@ -76,5 +76,5 @@ pub fn images(network: &Network, cameras: usize) -> Vec<Vec<u8>> {
 /// As a session takes them.
 pub fn views<'a>(network: &Network, images: &'a [Vec<u8>]) -> Vec<ImageView<'a>> {
     let [height, width] = network.image;
-    images.iter().map(|bgr| ImageView { height, width, bgr }).collect()
+    images.iter().map(|bgr| ImageView::bgr(height, width, bgr)).collect()
 }

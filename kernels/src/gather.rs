@@ -2,8 +2,10 @@
 //!
 //! ```text
 //! sum[c]    = x[col[ptr[r]]][c] + x[col[ptr[r] + 1]][c] + ...          ascending, starting from 0
-//! out[r][c] = end(sum[c] / max(1, ptr[r + 1] - ptr[r]))                 end: + bias[c], rectifier; both optional
+//! out[r][c] = end(sum[c] / max(1, entries of r))                        end: + bias[c], rectifier; both optional
 //! ```
+//!
+//! A [`Mask`] leaves out the pixels of some cameras: sum and count are then those of a matrix without their entries.
 //!
 //! Channels are the vector axis: a feature pixel is one contiguous piece of memory, and a row's sum stays in registers
 //! while its pixels stream by.
@@ -15,13 +17,73 @@ use std::ops::Range;
 /// Vectors summed at once: 64 channels, eight AVX2 registers.
 const VECTORS: usize = 4;
 
+/// Cameras whose pixels count as if the matrix did not name them.
+#[derive(Clone, Copy, Debug)]
+pub struct Mask<'a> {
+    /// Feature pixels of one camera; those of camera i are `i * pixels..(i + 1) * pixels`.
+    pub pixels: usize,
+    /// Whether each camera is left out.
+    pub masked: &'a [bool],
+}
+
+impl<'a> Mask<'a> {
+    /// The ascending columns `cols` of a row without those of masked cameras, as runs in order.
+    ///
+    /// # Panics
+    /// The iterator, if a column is not a pixel of one of the cameras.
+    pub fn kept(self, cols: &'a [u32]) -> Kept<'a> {
+        Kept { mask: Some(self), rest: cols }
+    }
+}
+
+/// Runs of a row's columns. See [`Mask::kept`].
+#[derive(Clone, Debug)]
+pub struct Kept<'a> {
+    mask: Option<Mask<'a>>,
+    rest: &'a [u32],
+}
+
+impl Kept<'_> {
+    /// Columns in all runs.
+    pub fn columns(self) -> usize {
+        self.map(<[u32]>::len).sum()
+    }
+}
+
+impl<'a> Iterator for Kept<'a> {
+    type Item = &'a [u32];
+
+    #[inline]
+    fn next(&mut self) -> Option<&'a [u32]> {
+        let Some(Mask { pixels, masked }) = self.mask else {
+            let all = std::mem::take(&mut self.rest);
+            return (!all.is_empty()).then_some(all);
+        };
+        while let Some(&first) = self.rest.first() {
+            let camera = first as usize / pixels;
+            let alike = masked[camera..].iter().take_while(|&&m| m == masked[camera]).count();
+            let end = (camera + alike) * pixels;
+            // At least one, so that columns that do not ascend cannot hold this up.
+            let len = self.rest.partition_point(|&col| (col as usize) < end).max(1);
+            let (run, rest) = self.rest.split_at(len);
+            self.rest = rest;
+            if !masked[camera] {
+                return Some(run);
+            }
+        }
+        None
+    }
+}
+
 /// A gather's arguments.
 #[derive(Clone, Copy, Debug)]
 pub struct Gather<'a> {
     /// `rows + 1` ascending offsets into `col`.
     pub ptr: &'a [u32],
-    /// Feature pixel of each entry, below `features.len() / stride`.
+    /// Feature pixel of each entry, below `features.len() / stride`; ascending within a row if there is a mask.
     pub col: &'a [u32],
+    /// Cameras to leave out.
+    pub mask: Option<Mask<'a>>,
     /// Feature pixels, `stride` numbers apart.
     pub features: &'a [f32],
     /// Distance between feature pixels.
@@ -60,8 +122,8 @@ struct Run<'a> {
 }
 
 impl Gather<'_> {
-    fn row(&self, row: usize) -> &[u32] {
-        &self.col[self.ptr[row] as usize..self.ptr[row + 1] as usize]
+    fn row(&self, row: usize) -> Kept<'_> {
+        Kept { mask: self.mask, rest: &self.col[self.ptr[row] as usize..self.ptr[row + 1] as usize] }
     }
 
     #[inline(always)]
@@ -77,12 +139,11 @@ impl Kernel for Run<'_> {
         let a = self.args;
         for (row, out) in self.rows.zip(self.out.chunks_exact_mut(a.channels.max(1))) {
             for (c, out) in out.iter_mut().enumerate() {
-                let cols = a.row(row);
                 let mut sum = 0.0;
-                for &col in cols {
+                for &col in a.row(row).flatten() {
                     sum += a.pixel(col, c, 1)[0];
                 }
-                *out = sum / cols.len().max(1) as f32;
+                *out = sum / a.row(row).columns().max(1) as f32;
                 if let Some(bias) = a.bias {
                     *out += bias[c];
                 }
@@ -97,18 +158,20 @@ impl Kernel for Run<'_> {
     fn run<S: Simd>(self, s: S) {
         let a = self.args;
         for (row, out) in self.rows.zip(self.out.chunks_exact_mut(a.channels.max(1))) {
-            let cols = a.row(row);
-            let count = s.splat(cols.len().max(1) as f32);
+            let row = a.row(row);
+            let count = s.splat(row.clone().columns().max(1) as f32);
             let mut channel = 0;
             while channel < a.channels {
                 let left = a.channels - channel;
                 let out = &mut out[channel..];
                 if left >= VECTORS * LANES {
                     let mut sums = [s.splat(0.0); VECTORS];
-                    for &col in cols {
-                        let (pixel, _) = a.pixel(col, channel, VECTORS * LANES).as_chunks();
-                        for v in 0..VECTORS {
-                            sums[v] = s.add(sums[v], s.load(&pixel[v]));
+                    for cols in row.clone() {
+                        for &col in cols {
+                            let (pixel, _) = a.pixel(col, channel, VECTORS * LANES).as_chunks();
+                            for v in 0..VECTORS {
+                                sums[v] = s.add(sums[v], s.load(&pixel[v]));
+                            }
                         }
                     }
                     for v in 0..VECTORS {
@@ -119,8 +182,10 @@ impl Kernel for Run<'_> {
                 } else {
                     let width = left.min(LANES);
                     let mut sum = s.splat(0.0);
-                    for &col in cols {
-                        sum = s.add(sum, s.load_part(a.pixel(col, channel, width)));
+                    for cols in row.clone() {
+                        for &col in cols {
+                            sum = s.add(sum, s.load_part(a.pixel(col, channel, width)));
+                        }
                     }
                     finish(s, a, channel, count, sum, &mut out[..width]);
                     channel += width;
@@ -185,6 +250,7 @@ mod tests {
             Gather {
                 ptr: &self.ptr,
                 col: &self.col,
+                mask: None,
                 features: &self.features,
                 stride: self.stride,
                 first_channel: self.first_channel,
@@ -234,6 +300,7 @@ mod tests {
             ptr: &[0, 2, 2, 3, 6],
             col: &[0, 1, 2, 2, 1, 1],
             features: &features,
+            mask: None,
             stride: 3,
             first_channel: 1,
             channels: 2,
@@ -249,6 +316,72 @@ mod tests {
             assert_eq!(out[..4], [0.0, 1.0, 4.0, 61.0]);
             (args.bias, args.relu) = (None, false);
         }
+    }
+
+    /// The case without the entries that `mask` leaves out.
+    fn without(case: &Case, mask: Mask<'_>) -> Case {
+        let (mut ptr, mut col) = (vec![0], vec![]);
+        for row in case.ptr.windows(2) {
+            let kept = |col: &&u32| !mask.masked[**col as usize / mask.pixels];
+            col.extend(case.col[row[0] as usize..row[1] as usize].iter().filter(kept));
+            ptr.push(col.len() as u32);
+        }
+        Case { ptr, col, features: case.features.clone(), bias: case.bias.clone(), ..*case }
+    }
+
+    #[test]
+    fn a_masked_camera_is_as_if_its_entries_were_not_there() {
+        let tally = Tally::default();
+        let run = |(lengths, channels, masked, seed): (Vec<usize>, usize, Vec<bool>, u64)| {
+            let pixels = 7;
+            let mut case = Case::new(&lengths, pixels * masked.len(), channels, [true, false], seed, Rng::wide);
+            for row in case.ptr.windows(2) {
+                case.col[row[0] as usize..row[1] as usize].sort_unstable();
+            }
+            let mask = Mask { pixels, masked: &masked };
+            let fewer = without(&case, mask);
+            let want = fewer.all(Isa::Scalar);
+            tally.count(&want);
+            for isa in Isa::available() {
+                let mut out = vec![f32::NAN; lengths.len() * channels];
+                gather(isa, &Gather { mask: Some(mask), ..case.args() }, 0..lengths.len(), &mut out);
+                assert_same_bits(&out, &want, isa.name());
+            }
+            for row in 0..lengths.len() {
+                let kept: Vec<u32> = mask.kept(case.args().row(row).next().unwrap_or(&[])).flatten().copied().collect();
+                let expected = fewer.args().row(row).next().unwrap_or(&[]).to_vec();
+                assert_eq!(
+                    (mask.kept(&case.col[case.ptr[row] as usize..case.ptr[row + 1] as usize]).columns(), kept),
+                    (expected.len(), expected)
+                );
+            }
+            Ok(())
+        };
+        let lengths = prop::collection::vec(0usize..30, 0..12);
+        let masked = prop::collection::vec(any::<bool>(), 1..9);
+        let mut runner = TestRunner::new(Config::default());
+        runner.run(&(lengths, 1usize..70, masked, any::<u64>()), run).unwrap();
+        tally.assert_half();
+    }
+
+    #[test]
+    fn kept_by_hand() {
+        let kept = |masked: &[bool], cols: &[u32]| -> Vec<Vec<u32>> {
+            Mask { pixels: 10, masked }.kept(cols).map(<[u32]>::to_vec).collect()
+        };
+        let cols = [3, 9, 10, 25, 29, 30, 39];
+        assert_eq!(kept(&[false; 4], &cols), [cols]);
+        assert_eq!(kept(&[false, true, false, false], &cols), [&cols[..2], &cols[3..]]);
+        assert_eq!(kept(&[true, false, true, false], &cols), [vec![10], vec![30, 39]]);
+        assert!(kept(&[true; 4], &cols).is_empty() && kept(&[false; 4], &[]).is_empty());
+        // Columns that do not ascend give some runs, and an end.
+        assert!(kept(&[true, false], &[15, 3, 12, 1]).concat().len() <= 4);
+    }
+
+    #[test]
+    #[should_panic(expected = "out of range")]
+    fn a_pixel_of_no_camera_under_a_mask() {
+        Mask { pixels: 10, masked: &[true] }.kept(&[20]).for_each(drop);
     }
 
     #[test]

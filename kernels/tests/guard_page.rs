@@ -246,6 +246,7 @@ fn gathered_rows() {
             let args = Gather {
                 ptr: &ptr,
                 col: &col,
+                mask: None,
                 features: &features,
                 stride,
                 first_channel,

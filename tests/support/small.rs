@@ -98,6 +98,6 @@ impl Images {
     }
 
     pub(crate) fn views(&self) -> Vec<ImageView<'_>> {
-        self.bytes.iter().map(|bgr| ImageView { height: self.height, width: self.width, bgr }).collect()
+        self.bytes.iter().map(|bgr| ImageView::bgr(self.height, self.width, bgr)).collect()
     }
 }
