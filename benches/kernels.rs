@@ -235,6 +235,7 @@ fn gathered(criterion: &mut Criterion, isa: Isa) {
             let args = Gather {
                 ptr: &ptr,
                 col: &col,
+                mask: None,
                 features: &features,
                 stride,
                 first_channel: 0,

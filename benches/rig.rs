@@ -1,12 +1,13 @@
 //! Building, saving and mapping the six matrices of `nuscenes-200` for a ring of six cameras.
 //!
-//! The threads are those of rayon's global pool: set `RAYON_NUM_THREADS` to choose.
+//! On as many threads as there are cores.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use std::hint::black_box;
 use std::time::Duration;
 use voxcast::Isa;
 use voxcast::Network;
+use voxcast::Threads;
 use voxcast::rig::{Rig, RigBuilder};
 
 /// Cameras 1.6 m above the ground that look outwards every 60 degrees, with a horizontal field of view of 65 degrees.
@@ -31,7 +32,9 @@ fn entries(rig: &Rig) -> u64 {
 fn rig(c: &mut Criterion) {
     let network = Network::built_in("nuscenes-200").expect("a built-in network");
     let cameras = ring(&network, 6);
-    let mut builder = RigBuilder::new(&network, cameras.len(), Isa::best()).expect("a size that can be built");
+    let threads = Threads::new(std::thread::available_parallelism().map_or(1, usize::from)).expect("threads");
+    let new = || RigBuilder::new(&network, cameras.len(), Isa::best()).map(|b| b.with_threads(threads.clone()));
+    let mut builder = new().expect("a size that can be built");
     let mut rig = builder.build(&cameras).expect("as many matrices as cameras");
     let path = std::env::temp_dir().join(format!("voxcast-bench-{}.safetensors", std::process::id()));
     rig.save(&path, &network).expect("a writable temporary directory");
@@ -40,7 +43,7 @@ fn rig(c: &mut Criterion) {
     group.sample_size(10).warm_up_time(Duration::from_millis(300)).measurement_time(Duration::from_secs(1));
     group.throughput(Throughput::Elements(entries(&rig)));
     group.bench_function("build/nuscenes-200", |b| {
-        b.iter(|| RigBuilder::new(&network, cameras.len(), Isa::best()).and_then(|mut b| b.build(black_box(&cameras))));
+        b.iter(|| new().and_then(|mut builder| builder.build(black_box(&cameras))));
     });
     group.bench_function("rebuild/nuscenes-200", |b| b.iter(|| builder.rebuild(black_box(&cameras), &mut rig)));
     group.bench_function("open/nuscenes-200", |b| b.iter(|| Rig::open(black_box(&path), &network, cameras.len())));

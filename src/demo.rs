@@ -7,7 +7,6 @@ use crate::network::Network;
 use crate::random::Random;
 use crate::scene::{Image, Scene, forward_of};
 use glam::{DVec3, Vec3};
-use rayon::prelude::*;
 use std::collections::BTreeMap;
 
 /// The six cameras of nuScenes in its order: name, yaw in degrees (left is positive), place in metres ahead of, left of and
@@ -128,7 +127,7 @@ impl Pinhole {
         // Small images show every jagged edge.
         let samples = (900 / width).clamp(1, 3);
         let mut bgr = vec![0u8; height * width * 3];
-        bgr.par_chunks_mut(width * 3).enumerate().for_each(|(v, row)| {
+        bgr.chunks_mut(width * 3).enumerate().for_each(|(v, row)| {
             for (u, pixel) in row.chunks_exact_mut(3).enumerate() {
                 let mut sum = Vec3::ZERO;
                 for s in 0..samples * samples {

@@ -9,7 +9,7 @@ use std::any::Any;
 use std::fmt;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 /// The threads of a session. Their number cannot change a result.
@@ -80,19 +80,6 @@ impl Threads {
         }
     }
 
-    /// Runs `f` such that what it does in parallel with rayon uses this many threads: those of the pool, or as many of
-    /// their own, started when first asked for. Where the system refuses to start them, rayon's global pool serves.
-    pub fn install<R: Send>(&self, f: impl FnOnce() -> R + Send) -> R {
-        match &self.0 {
-            Kind::Calling => f(),
-            Kind::Crew(crew) => match crew.rayon() {
-                Some(pool) => pool.install(f),
-                None => f(),
-            },
-            Kind::Pool(pool) => pool.install(f),
-        }
-    }
-
     /// Runs `f`, which calls [`Threads::for_each_tile`], where that is cheapest.
     pub(crate) fn enter<R: Send>(&self, f: impl FnOnce() -> R + Send) -> R {
         match &self.0 {
@@ -157,7 +144,6 @@ struct Crew {
     /// Held by the one that brings work.
     turn: Mutex<()>,
     threads: Vec<JoinHandle<()>>,
-    rayon: OnceLock<Option<ThreadPool>>,
 }
 
 #[derive(Default)]
@@ -212,7 +198,7 @@ impl Crew {
     fn new(count: usize) -> std::io::Result<Self> {
         let shared = Arc::new(Shared::default());
         // Dropping a crew ends and joins those that were started, also when a later one cannot be.
-        let mut crew = Self { shared, turn: Mutex::new(()), threads: vec![], rayon: OnceLock::new() };
+        let mut crew = Self { shared, turn: Mutex::new(()), threads: vec![] };
         for worker in 1..count {
             let shared = crew.shared.clone();
             let builder = std::thread::Builder::new().name(format!("voxcast {worker}"));
@@ -223,11 +209,6 @@ impl Crew {
 
     fn count(&self) -> usize {
         self.threads.len() + 1
-    }
-
-    fn rayon(&self) -> Option<&ThreadPool> {
-        let build = || rayon::ThreadPoolBuilder::new().num_threads(self.count()).build().ok();
-        self.rayon.get_or_init(build).as_ref()
     }
 
     /// Runs `work(0)` here and `work(1)` to `work(workers - 1)` on the crew, and returns when all of them have.
@@ -374,14 +355,6 @@ mod tests {
             ids.dedup();
             assert_eq!(ids.len(), threads.count(), "different threads");
         }
-    }
-
-    #[test]
-    fn rayon_finds_as_many_threads() {
-        for threads in [2, 3].into_iter().flat_map(kinds) {
-            assert_eq!(threads.install(rayon::current_num_threads), threads.count());
-        }
-        assert_eq!(Threads::calling().install(|| 7), 7);
     }
 
     #[test]

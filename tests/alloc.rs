@@ -1,4 +1,4 @@
-//! After the first frame nothing is allocated, on any thread of the process.
+//! A session takes what it said it would, and after the first frame nothing is allocated, on any thread of the process.
 //!
 //! This file holds one test only: a second one would run beside it, and its allocations would count.
 
@@ -8,10 +8,12 @@ mod small;
 
 use small::Images;
 use std::alloc::{GlobalAlloc, Layout, System};
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicIsize, AtomicUsize, Ordering};
+use std::time::Duration;
 use voxcast::graph::Rewrites;
 use voxcast::weights::Precision;
-use voxcast::{Isa, Session, SessionOptions, Threads};
+use voxcast::{Budget, ImageView, Isa, Model, Network, Rig, Session, SessionOptions, Step, Threads};
 
 /// The system's allocator, which counts while it is told to.
 struct Counting;
@@ -19,30 +21,32 @@ struct Counting;
 static COUNTING: AtomicBool = AtomicBool::new(false);
 static CALLS: AtomicUsize = AtomicUsize::new(0);
 static BYTES: AtomicUsize = AtomicUsize::new(0);
+static HELD: AtomicIsize = AtomicIsize::new(0);
 
-fn count(bytes: usize) {
+fn count(asked: usize, given_back: usize) {
     if COUNTING.load(Ordering::SeqCst) {
         CALLS.fetch_add(1, Ordering::SeqCst);
-        BYTES.fetch_add(bytes, Ordering::SeqCst);
+        BYTES.fetch_add(asked, Ordering::SeqCst);
+        HELD.fetch_add(asked as isize - given_back as isize, Ordering::SeqCst);
     }
 }
 
 // SAFETY: every call goes to the system's allocator unchanged; counting neither allocates nor unwinds.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        count(layout.size());
+        count(layout.size(), 0);
         // SAFETY: the caller's promises are those of `System::alloc`.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        count(0);
+        count(0, layout.size());
         // SAFETY: as above.
         unsafe { System.dealloc(pointer, layout) }
     }
 
     unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        count(size);
+        count(size, layout.size());
         // SAFETY: as above.
         unsafe { System.realloc(pointer, layout, size) }
     }
@@ -61,13 +65,23 @@ fn counted(work: impl FnOnce()) -> (usize, usize) {
     (CALLS.load(Ordering::SeqCst), BYTES.load(Ordering::SeqCst))
 }
 
+/// What the allocator holds more of after `work` than before, in bytes, and how often `work` called it.
+fn held<R>(work: impl FnOnce() -> R) -> (R, isize, usize) {
+    HELD.store(0, Ordering::SeqCst);
+    let mut result = None;
+    let (calls, _) = counted(|| result = Some(work()));
+    (result.expect("work was done"), HELD.load(Ordering::SeqCst), calls)
+}
+
 /// Queues that grow by blocks would show after some dozens of frames.
 const FRAMES: usize = 200;
 
 #[test]
-fn frames_after_the_first_allocate_nothing() {
+fn everything_is_allocated_when_a_session_is_made_and_known_before() {
     let (calls, bytes) = counted(|| drop(std::hint::black_box(vec![0u8; 100])));
     assert_eq!((calls, bytes), (2, 100), "the counter counts");
+    let (kept, bytes, calls) = held(|| std::hint::black_box(vec![0u8; 100]));
+    assert_eq!((kept.len(), bytes, calls), (100, 100, 1), "what is held is counted");
     let mut network = small::network();
     network.image = [32, 64];
     network.grids = [[8, 12, 4], [4, 6, 2], [2, 3, 1]];
@@ -75,25 +89,65 @@ fn frames_after_the_first_allocate_nothing() {
     let images = Images::new(&network, 5);
     let images = images.views();
     for (precision, rewrites) in [(Precision::F32, Rewrites::ALL), (Precision::F16, Rewrites::NONE)] {
+        opening_takes_the_same_each_time(&network, precision, rewrites);
         let model = small::model(&network, precision, rewrites, 1);
         for threads in [1, 2, 3] {
             let options = SessionOptions {
                 isa: Isa::best(),
                 threads: Threads::new(threads).unwrap(),
-                logits: true,
+                logits: threads != 2,
+                coarse_heads: threads == 3,
+                slice_cost: 1000,
                 ..SessionOptions::default()
             };
-            let mut session = Session::new(model.clone(), rigs[0].clone(), &options).unwrap();
+            // What a thread still frees of its own start is not the session's.
+            options.threads.broadcast(|| ());
+            let promised = Session::memory(&model, 2, &options).unwrap();
+            let make = || Session::new(model.clone(), rigs[0].clone(), &options).unwrap();
+            let (first, bytes, calls) = held(make);
+            let (mut session, again, calls_again) = held(make);
+            assert_eq!(bytes, promised.total() as isize, "{promised:?} on {threads} threads, {precision:?}");
+            assert_eq!((again, calls_again), (bytes, calls), "a session takes the same each time");
+            assert_eq!(first.taken(), promised);
+            drop(first);
             session.run(&images).unwrap();
             let mut occupied = 0;
+            let mut spare = Some(rigs[1].clone());
             let found = counted(|| {
                 for frame in 0..FRAMES {
                     occupied += session.run(&images).unwrap().classes.iter().filter(|&&c| c != 0).count();
-                    session.set_rig(rigs[(frame + 1) % 2].clone()).unwrap();
+                    spare = spare.take().map(|spare| control(&mut session, spare, &images, frame));
                 }
             });
             assert!(occupied > 0);
             assert_eq!(found, (0, 0), "calls and bytes in {FRAMES} frames on {threads} threads, {precision:?}");
         }
     }
+}
+
+/// A model's file is mapped; what is allocated is what its header says.
+fn opening_takes_the_same_each_time(network: &Network, precision: Precision, rewrites: Rewrites) {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("model");
+    std::fs::write(&path, small::model_bytes(network, precision, rewrites, 1)).unwrap();
+    let (model, bytes, calls) = held(|| Model::open(&path).unwrap());
+    let (_again, bytes_again, calls_again) = held(|| Model::open(&path).unwrap());
+    assert_eq!((bytes, calls), (bytes_again, calls_again));
+    assert!(bytes > 0 && bytes < model.file_size() as isize / 2, "{bytes} bytes for a model of {}", model.file_size());
+}
+
+/// A frame as a controller makes it: one camera's image, steps, another rig, a mask.
+fn control(session: &mut Session, spare: Arc<Rig>, images: &[ImageView<'_>], frame: usize) -> Arc<Rig> {
+    session.set_camera(frame % 2, images[frame % 2]).unwrap();
+    let budget = if frame % 3 == 0 { Budget::Time(Duration::from_micros(500)) } else { Budget::Slices(40) };
+    for _ in 0..3 {
+        session.step(budget);
+    }
+    let replaced = session.set_rig(spare).unwrap();
+    session.set_masked(1, frame % 4 == 0).unwrap();
+    while session.step(budget) == Step::Running {}
+    let mut bits = [0; 4096];
+    let result = session.occupancy().unwrap();
+    result.write_bits(&mut bits[..result.bits_len()]);
+    replaced
 }

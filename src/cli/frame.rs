@@ -22,7 +22,7 @@ pub fn rig(path: Option<&Path>, model: &Model, scene: &Scene, options: &SessionO
         Some(path) => Rig::open(path, model.network(), scene.cameras()),
         None => {
             let built = RigBuilder::new(model.network(), scene.cameras(), options.isa)
-                .and_then(|mut builder| options.threads.install(|| builder.build(&scene.lidar2img)));
+                .and_then(|builder| builder.with_threads(options.threads.clone()).build(&scene.lidar2img));
             built.map_err(|e| in_model(e, model))
         }
     }

@@ -32,9 +32,10 @@ impl BuildRig {
         let lidar2img = frame::calibration(&self.scene)?;
         let threads = self.machine.threads()?;
         let mut builder = voxcast::rig::RigBuilder::new(model.network(), lidar2img.len(), self.machine.isa()?)
-            .map_err(|e| e.in_file(&self.model))?;
+            .map_err(|e| e.in_file(&self.model))?
+            .with_threads(threads.clone());
         let start = Instant::now();
-        let rig = threads.install(|| builder.build(&lidar2img)).map_err(|e| e.in_file(&self.scene))?;
+        let rig = builder.build(&lidar2img).map_err(|e| e.in_file(&self.scene))?;
         let elapsed = start.elapsed();
         rig.save(&self.output, model.network())?;
         for index in 0..3 {

@@ -20,9 +20,10 @@ use super::view::View;
 use super::{Rig, Storage, Tensors};
 use crate::error::{Error, ErrorKind, Result};
 use crate::network::Network;
-use rayon::prelude::*;
+use crate::threads::Threads;
+use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use voxcast_kernels::Isa;
 use voxcast_kernels::project::project_points;
 
@@ -41,19 +42,47 @@ const SLABS: usize = 128;
 /// Points that the kernel takes at once; lines of sample points are padded to a multiple with points that hit nothing.
 const LANES: usize = 8;
 
-/// Builds [`Rig`]s of one network and number of cameras.
+/// Builds [`Rig`]s of one network and number of cameras, on the calling thread or those of [`RigBuilder::with_threads`].
 ///
-/// It keeps every buffer between builds, and [`RigBuilder::rebuild`] those of the rig too: once buffers have grown to
-/// what the calibrations at hand need, rebuilding allocates no matrix memory.
+/// It keeps every buffer between builds, and [`RigBuilder::rebuild`] trades them with the rig: once all have grown to what
+/// the calibrations at hand need, rebuilding allocates nothing.
+///
+/// A controller that has little time at a time calls [`RigBuilder::begin`] and [`RigBuilder::advance`], and swaps two rigs:
+///
+/// ```
+/// use std::sync::Arc;
+/// use voxcast::rig::RigBuilder;
+/// use voxcast::{Isa, Network, Rig, Session};
+///
+/// /// Some of the work on `spare`, which no session uses. Whether the session has it now, and `spare` is the other.
+/// fn tick(builder: &mut RigBuilder, spare: &mut Arc<Rig>, session: &mut Session) -> voxcast::Result<bool> {
+///     let rig = Arc::get_mut(spare).expect("nobody else holds the spare rig");
+///     let complete = builder.advance(8, rig)?;
+///     if complete {
+///         *spare = session.set_rig(spare.clone())?;
+///     }
+///     Ok(complete)
+/// }
+/// # let network = Network::built_in("nuscenes-200").expect("built in");
+/// # RigBuilder::new(&network, 6, Isa::best())?;
+/// # Ok::<(), voxcast::Error>(())
+/// ```
 pub struct RigBuilder {
     levels: [Level; 3],
-    slabs: Vec<Slab>,
+    slabs: Vec<Mutex<Slab>>,
     /// The cameras of the last build, per level.
     views: [Vec<View>; 3],
-    /// One per thread of the pool.
+    /// One per thread.
     scratch: Vec<Mutex<Scratch>>,
+    threads: Threads,
     cameras: usize,
     isa: Isa,
+    /// Entries of each matrix so far.
+    entries: [[AtomicU64; 2]; 3],
+    /// Where rows are joined before a rig has them.
+    tensors: Tensors<Vec<u32>>,
+    /// Slabs computed, then slabs joined; nothing where no build is under way.
+    done: Option<usize>,
 }
 
 /// What is fixed about a level.
@@ -119,18 +148,35 @@ impl RigBuilder {
         for (l, level) in levels.iter().enumerate() {
             let columns = level.grid[0] * level.grid[1];
             let step = columns.div_ceil(SLABS);
-            slabs.extend((0..columns).step_by(step).map(|from| Slab {
-                level: l,
-                columns: from..columns.min(from + step),
-                volume: Rows::default(),
-                bev: Rows::default(),
+            slabs.extend((0..columns).step_by(step).map(|from| {
+                let columns = from..columns.min(from + step);
+                Mutex::new(Slab { level: l, columns, volume: Rows::default(), bev: Rows::default() })
             }));
         }
-        Ok(Self { levels, slabs, views: Default::default(), scratch: Vec::new(), cameras, isa })
+        Ok(Self {
+            levels,
+            slabs,
+            views: Default::default(),
+            scratch: vec![Mutex::default()],
+            threads: Threads::calling(),
+            cameras,
+            isa,
+            entries: Default::default(),
+            tensors: Tensors::default(),
+            done: None,
+        })
+    }
+
+    /// The builder with threads to compute on. Their number cannot change a rig.
+    #[must_use]
+    pub fn with_threads(mut self, threads: Threads) -> Self {
+        self.scratch.resize_with(threads.count(), Mutex::default);
+        self.threads = threads;
+        self
     }
 
     /// The matrices for `lidar2img`: per camera, row-major 4x4, lidar-frame metres (x, y, z, 1) to (u * d, v * d, d, 1)
-    /// with u, v in image pixels. Runs on the current rayon pool; the result does not depend on its threads.
+    /// with u, v in image pixels.
     ///
     /// No matrix is wrong: numbers that are not finite, or a camera that sees nothing of the grid, give no entries.
     ///
@@ -138,59 +184,29 @@ impl RigBuilder {
     /// [`ErrorKind::Mismatch`] if there are not as many matrices as cameras; [`ErrorKind::TooLarge`] if a matrix has
     /// more than 2^32 - 1 entries or memory runs out.
     pub fn build(&mut self, lidar2img: &[[f32; 16]]) -> Result<Rig> {
-        self.fill_slabs(lidar2img)?;
-        let mut tensors = Tensors::default();
-        self.join(&mut tensors)?;
-        Ok(Rig { storage: Storage::Owned(tensors), cameras: self.cameras })
+        let mut rig = Rig { storage: Storage::Owned(Tensors::default()), cameras: self.cameras };
+        self.rebuild(lidar2img, &mut rig)?;
+        Ok(rig)
     }
 
-    /// [`RigBuilder::build`] into the memory of `rig`, of which nothing else remains. A mapped rig lets go of its file.
+    /// [`RigBuilder::build`] into `rig`, whose memory serves the next build. A mapped rig lets go of its file.
     ///
     /// # Errors
     /// As [`RigBuilder::build`]; `rig` is as before then.
     pub fn rebuild(&mut self, lidar2img: &[[f32; 16]], rig: &mut Rig) -> Result<()> {
-        match &mut rig.storage {
-            Storage::Mapped(..) => *rig = self.build(lidar2img)?,
-            Storage::Owned(tensors) => {
-                self.fill_slabs(lidar2img)?;
-                self.join(tensors)?;
-                rig.cameras = self.cameras;
-            }
-        }
-        Ok(())
+        self.begin(lidar2img)?;
+        self.advance(usize::MAX, rig).map(|complete| debug_assert!(complete))
     }
 
-    /// Joins the slabs' rows. Fails, if it does, before it changes a number.
-    fn join(&self, tensors: &mut Tensors<Vec<u32>>) -> Result<()> {
-        let slabs: [&[Slab]; 3] = std::array::from_fn(|l| {
-            let own = self.slabs.partition_point(|s| s.level < l)..self.slabs.partition_point(|s| s.level <= l);
-            &self.slabs[own]
-        });
-        for (tensors, slabs) in tensors.iter_mut().zip(slabs) {
-            for (pair, pick) in tensors.chunks_exact_mut(2).zip(PICKS) {
-                let entries = slabs.iter().map(|s| pick(s).col.len()).sum();
-                let rows: usize = slabs.iter().map(|s| pick(s).ends.len()).sum();
-                for (words, len) in pair.iter_mut().zip([rows + 1, entries]) {
-                    words.try_reserve_exact(len.saturating_sub(words.len())).map_err(out_of_memory)?;
-                }
-            }
-        }
-        for (tensors, slabs) in tensors.iter_mut().zip(slabs) {
-            let [volume_ptr, volume_col, bev_ptr, bev_col] = tensors;
-            join_rows(slabs, PICKS[0], volume_ptr, volume_col);
-            join_rows(slabs, PICKS[1], bev_ptr, bev_col);
-        }
-        Ok(())
-    }
-
-    /// Computes the rows of all slabs.
-    fn fill_slabs(&mut self, lidar2img: &[[f32; 16]]) -> Result<()> {
+    /// Begins a rig for `lidar2img`, which [`RigBuilder::advance`] builds. One that was under way is dropped.
+    ///
+    /// # Errors
+    /// As [`RigBuilder::build`].
+    pub fn begin(&mut self, lidar2img: &[[f32; 16]]) -> Result<()> {
+        self.done = None;
         if lidar2img.len() != self.cameras {
             let found = lidar2img.len();
             return Err(Error::mismatch(format!("{found} camera matrices, the builder expects {}", self.cameras)));
-        }
-        while self.scratch.len() < rayon::current_num_threads() {
-            self.scratch.push(Mutex::default());
         }
         let points = self.levels.iter().map(|l| self.cameras * l.points()).max().unwrap_or(0);
         let pixels = self.levels.iter().map(|l| self.cameras * l.pixels).max().unwrap_or(0);
@@ -201,22 +217,104 @@ impl RigBuilder {
             views.clear();
             views.extend(lidar2img.iter().enumerate().map(|(c, m)| View::new(level, self.cameras, c, m)));
         }
-        let entries: [[AtomicU64; 2]; 3] = Default::default();
-        let (levels, views, scratch, isa) = (&self.levels, &self.views, &self.scratch, self.isa);
-        self.slabs.par_iter_mut().with_max_len(1).try_for_each(|slab| {
-            // Slabs start no parallel work of their own, so a thread never meets its own lock.
-            let thread = rayon::current_thread_index().unwrap_or(0) % scratch.len();
-            let mut scratch = scratch[thread].lock().unwrap_or_else(PoisonError::into_inner);
-            slab.fill(&levels[slab.level], &views[slab.level], &mut scratch, isa)?;
-            for (total, rows) in entries[slab.level].iter().zip([&slab.volume, &slab.bev]) {
-                let more = rows.col.len() as u64;
-                if total.fetch_add(more, Ordering::Relaxed) + more > u64::from(u32::MAX) {
-                    return Err(too_many_entries());
-                }
-            }
-            Ok(())
-        })
+        self.entries = Default::default();
+        self.done = Some(0);
+        Ok(())
     }
+
+    /// Steps that a whole build takes: [`RigBuilder::advance`] counts in them.
+    pub fn steps(&self) -> usize {
+        2 * self.slabs.len()
+    }
+
+    /// Does `steps` of the [`RigBuilder::steps`] of the rig that was begun, each at most a hundredth or so of a level.
+    /// True if it is complete; `rig` is the new one then, and unchanged before.
+    ///
+    /// # Errors
+    /// [`ErrorKind::TooLarge`] as [`RigBuilder::build`]; [`ErrorKind::Mismatch`] if nothing was begun. `rig` is as before.
+    pub fn advance(&mut self, steps: usize, rig: &mut Rig) -> Result<bool> {
+        // An error leaves nothing under way.
+        let Some(from) = self.done.take() else {
+            return Err(Error::mismatch("no rig was begun, expected a call of `begin` first"));
+        };
+        let slabs = self.slabs.len();
+        let to = from.saturating_add(steps.max(1)).min(2 * slabs);
+        if from < slabs {
+            self.fill(from..to.min(slabs))?;
+        }
+        if to > slabs {
+            if from <= slabs {
+                self.reserve()?;
+            }
+            for slab in from.max(slabs)..to {
+                self.join(slab - slabs);
+            }
+        }
+        if to < 2 * slabs {
+            self.done = Some(to);
+            return Ok(false);
+        }
+        match &mut rig.storage {
+            Storage::Owned(tensors) => std::mem::swap(tensors, &mut self.tensors),
+            mapped => *mapped = Storage::Owned(std::mem::take(&mut self.tensors)),
+        }
+        rig.cameras = self.cameras;
+        Ok(true)
+    }
+
+    /// Computes the rows of some slabs.
+    fn fill(&self, slabs: Range<usize>) -> Result<()> {
+        let failed = Mutex::new(None);
+        let fill = |worker: usize, index: usize| {
+            // Every slab and every worker's scratch is one tile's at a time, so no lock is waited for.
+            let (mut slab, mut scratch) = (lock(&self.slabs[slabs.start + index]), lock(&self.scratch[worker]));
+            let level = slab.level;
+            let filled = slab.fill(&self.levels[level], &self.views[level], &mut scratch, self.isa);
+            let counted = filled.and_then(|()| {
+                self.entries[level].iter().zip([&slab.volume, &slab.bev]).try_for_each(|(total, rows)| {
+                    let more = rows.col.len() as u64;
+                    let sum = total.fetch_add(more, Ordering::Relaxed) + more;
+                    if sum > u64::from(u32::MAX) { Err(too_many_entries()) } else { Ok(()) }
+                })
+            });
+            if let Err(error) = counted {
+                lock(&failed).get_or_insert(error);
+            }
+        };
+        self.threads.enter(|| self.threads.for_each_tile(self.scratch.len(), slabs.len(), &fill));
+        failed.into_inner().unwrap_or_else(PoisonError::into_inner).map_or(Ok(()), Err)
+    }
+
+    /// Makes room for all rows.
+    fn reserve(&mut self) -> Result<()> {
+        for (level, (tensors, entries)) in self.levels.iter().zip(self.tensors.iter_mut().zip(&mut self.entries)) {
+            let columns = level.grid[0] * level.grid[1];
+            let rows = [columns * level.grid[2], columns];
+            for ((pair, entries), rows) in tensors.as_chunks_mut::<2>().0.iter_mut().zip(entries).zip(rows) {
+                for (words, len) in pair.iter_mut().zip([rows + 1, *entries.get_mut() as usize]) {
+                    words.clear();
+                    words.try_reserve_exact(len).map_err(out_of_memory)?;
+                }
+                pair[0].push(0);
+            }
+        }
+        Ok(())
+    }
+
+    /// Appends the rows of a slab. There is room.
+    fn join(&mut self, slab: usize) {
+        let slab = self.slabs[slab].get_mut().unwrap_or_else(PoisonError::into_inner);
+        let [volume_ptr, volume_col, bev_ptr, bev_col] = &mut self.tensors[slab.level];
+        for (ptr, col, rows) in [(volume_ptr, volume_col, &slab.volume), (bev_ptr, bev_col, &slab.bev)] {
+            let start = col.len() as u32;
+            ptr.extend(rows.ends.iter().map(|end| start + end));
+            col.extend_from_slice(&rows.col);
+        }
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl std::fmt::Debug for RigBuilder {
@@ -327,35 +425,4 @@ impl Scratch {
         self.voxel.reserve(pixels)?;
         self.column.reserve(pixels)
     }
-}
-
-/// The rows of a slab in the volume's and in the BEV's matrix.
-const PICKS: [fn(&Slab) -> &Rows; 2] = [|s| &s.volume, |s| &s.bev];
-
-/// Joins the rows that `pick` names of each slab. Both vectors have room.
-fn join_rows(slabs: &[Slab], pick: fn(&Slab) -> &Rows, ptr: &mut Vec<u32>, col: &mut Vec<u32>) {
-    ptr.resize(slabs.iter().map(|s| pick(s).ends.len()).sum::<usize>() + 1, 0);
-    col.resize(slabs.iter().map(|s| pick(s).col.len()).sum(), 0);
-    ptr[0] = 0;
-    copy_rows(slabs, pick, 0, &mut ptr[1..], col);
-}
-
-/// Copies the slabs' rows, the first of which starts at entry `start`, halves in parallel.
-fn copy_rows(slabs: &[Slab], pick: fn(&Slab) -> &Rows, start: u32, ptr: &mut [u32], col: &mut [u32]) {
-    if let [slab] = slabs {
-        let rows = pick(slab);
-        for (ptr, end) in ptr.iter_mut().zip(&rows.ends) {
-            *ptr = start + end;
-        }
-        col.copy_from_slice(&rows.col);
-        return;
-    }
-    let (left, right) = slabs.split_at(slabs.len() / 2);
-    let (left_ptr, right_ptr) = ptr.split_at_mut(left.iter().map(|s| pick(s).ends.len()).sum());
-    let (left_col, right_col) = col.split_at_mut(left.iter().map(|s| pick(s).col.len()).sum());
-    let middle = start + left_col.len() as u32;
-    rayon::join(
-        || copy_rows(left, pick, start, left_ptr, left_col),
-        || copy_rows(right, pick, middle, right_ptr, right_col),
-    );
 }

@@ -4,10 +4,12 @@ use super::*;
 use crate::container::{self, Data, Layout, Tensor};
 use crate::error::{Error, ErrorKind};
 use crate::network::{Network, Sampling};
+use crate::threads::Threads;
 use proptest::prelude::*;
 use safetensors::Dtype;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
+use std::sync::Arc;
 use voxcast_kernels::Isa;
 
 type Matrix = [f32; 16];
@@ -209,20 +211,42 @@ fn many_pixels_and_slabs() {
 fn threads_do_not_show() {
     let network = network([9, 7, 2], [3, 2, 2], [96, 160], Sampling::Linspace);
     let cameras = ring(5, network.image, 0.7);
-    let on = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| build(&network, &cameras))
-    };
-    let one = on(1);
+    let one = build(&network, &cameras);
     assert_naive(&network, &cameras, &one);
-    for threads in [2, 3, 8] {
-        assert!(on(threads) == one, "{threads} threads");
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+    let crews = [0, 1, 2, 3, 8].map(|threads| Threads::new(threads).unwrap());
+    for threads in crews.into_iter().chain([Threads::pool(Arc::new(pool))]) {
+        let mut builder = RigBuilder::new(&network, 5, Isa::best()).unwrap().with_threads(threads.clone());
+        assert!(builder.build(&cameras).unwrap() == one, "{threads:?}");
     }
-    // One builder on pools of different sizes.
-    let mut builder = RigBuilder::new(&network, 5, Isa::best()).unwrap();
-    for threads in [1, 4, 2] {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        assert!(pool.install(|| builder.build(&cameras)).unwrap() == one);
+}
+
+#[test]
+fn steps_do_not_show() {
+    let network = network([9, 7, 2], [3, 2, 2], [96, 160], Sampling::Linspace);
+    let [cameras, others] = [0.7, 0.2].map(|turn| ring(5, network.image, turn));
+    let (expected, before) = (build(&network, &cameras), build(&network, &others));
+    assert!(expected != before);
+    for (threads, steps) in [(1, 1), (2, 1), (2, 7), (3, 1000), (1, usize::MAX), (1, 0)] {
+        let builder = RigBuilder::new(&network, 5, Isa::best()).unwrap();
+        let mut builder = builder.with_threads(Threads::new(threads).unwrap());
+        let mut rig = builder.build(&others).unwrap();
+        // What was begun before is dropped.
+        builder.begin(&others).unwrap();
+        assert!(steps == usize::MAX || !builder.advance(3, &mut rig).unwrap());
+        builder.begin(&cameras).unwrap();
+        let mut calls = 1;
+        while !builder.advance(steps, &mut rig).unwrap() {
+            assert!(rig == before, "unchanged until it is complete");
+            calls += 1;
+        }
+        assert!(rig == expected, "{threads} threads, {steps} steps");
+        assert_eq!(calls, builder.steps().div_ceil(steps.max(1)));
+        let error = builder.advance(1, &mut rig).unwrap_err();
+        assert_eq!(
+            (error.kind(), error.message()),
+            (ErrorKind::Mismatch, "no rig was begun, expected a call of `begin` first")
+        );
     }
 }
 
@@ -233,9 +257,13 @@ fn rebuilding_keeps_memory() {
     let mut builder = RigBuilder::new(&network, 6, Isa::best()).unwrap();
     let mut rig = builder.build(&cameras).unwrap();
     let at = |rig: &Rig| [0, 1, 2].map(|l| (rig.level(l).volume.col.as_ptr(), rig.level(l).bev.ptr.as_ptr()));
-    let before = at(&rig);
+    let first = at(&rig);
     builder.rebuild(&cameras, &mut rig).unwrap();
-    assert_eq!(at(&rig), before);
+    let second = at(&rig);
+    for expected in [first, second, first] {
+        builder.rebuild(&cameras, &mut rig).unwrap();
+        assert_eq!(at(&rig), expected, "two memories take turns");
+    }
 }
 
 #[test]
