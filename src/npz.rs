@@ -18,6 +18,8 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 pub enum Elements<'a> {
     /// Unsigned bytes, NumPy's `uint8`.
     U8(&'a [u8]),
+    /// Unsigned 16-bit numbers, NumPy's `uint16`.
+    U16(&'a [u16]),
     /// Single precision floats, NumPy's `float32`.
     F32(&'a [f32]),
 }
@@ -38,6 +40,8 @@ pub struct Array<'a> {
 pub enum OwnedElements {
     /// Unsigned bytes.
     U8(Vec<u8>),
+    /// Unsigned 16-bit numbers.
+    U16(Vec<u16>),
     /// Single precision floats, bit for bit as stored.
     F32(Vec<f32>),
 }
@@ -98,6 +102,7 @@ fn check_arrays(arrays: &[Array<'_>]) -> Result<()> {
         }
         let found = match array.elements {
             Elements::U8(v) => v.len(),
+            Elements::U16(v) => v.len(),
             Elements::F32(v) => v.len(),
         };
         if array.shape.len() > MAX_AXES || product(array.shape) != Some(found) {
@@ -115,6 +120,7 @@ fn product(shape: &[usize]) -> Option<usize> {
 fn write_array<W: Write + Seek>(zip: &mut ZipWriter<W>, array: &Array<'_>) -> io::Result<()> {
     let (descr, method, bytes) = match array.elements {
         Elements::U8(v) => ("|u1", CompressionMethod::Deflated, v.len() as u64),
+        Elements::U16(v) => ("<u2", CompressionMethod::Deflated, 2 * v.len() as u64),
         Elements::F32(v) => ("<f4", CompressionMethod::Stored, 4 * v.len() as u64),
     };
     let header = npy_header(descr, array.shape);
@@ -127,16 +133,24 @@ fn write_array<W: Write + Seek>(zip: &mut ZipWriter<W>, array: &Array<'_>) -> io
     zip.write_all(&header)?;
     match array.elements {
         Elements::U8(v) => zip.write_all(v),
-        Elements::F32(v) => {
-            let mut buffer = Vec::with_capacity(1 << 16);
-            for part in v.chunks(1 << 14) {
-                buffer.clear();
-                buffer.extend(part.iter().flat_map(|f| f.to_le_bytes()));
-                zip.write_all(&buffer)?;
-            }
-            Ok(())
-        }
+        Elements::U16(v) => write_numbers(zip, v, |n| n.to_le_bytes()),
+        Elements::F32(v) => write_numbers(zip, v, |n| n.to_le_bytes()),
     }
+}
+
+/// Writes numbers through a small buffer, as the bytes that `bytes` makes of each.
+fn write_numbers<T: Copy, const N: usize>(
+    out: &mut impl Write,
+    numbers: &[T],
+    bytes: impl Fn(T) -> [u8; N],
+) -> io::Result<()> {
+    let mut buffer = Vec::with_capacity(1 << 16);
+    for part in numbers.chunks((1 << 16) / N) {
+        buffer.clear();
+        buffer.extend(part.iter().flat_map(|&n| bytes(n)));
+        out.write_all(&buffer)?;
+    }
+    Ok(())
 }
 
 /// Magic, version, length and the Python literal, padded so that the elements start at a multiple of 64.
@@ -154,7 +168,7 @@ fn npy_header(descr: &str, shape: &[usize]) -> Vec<u8> {
     header
 }
 
-/// Reads every array of the `.npz` at `path`: `uint8`, `bool` (as bytes) and little-endian `float32`, in C order.
+/// Reads every array of the `.npz` at `path`: `uint8`, `bool` (as bytes), little-endian `uint16` and `float32`, in C order.
 ///
 /// Memory is taken as elements arrive, never for what a header merely claims.
 ///
@@ -215,9 +229,10 @@ fn read_array(entry: &mut impl Read, size: u64) -> Result<(Vec<usize>, OwnedElem
     let (descr, shape) = parse_header(literal)?;
     let item = match descr {
         "|u1" | "u1" | "<u1" | "|b1" => 1,
+        "<u2" => 2,
         "<f4" => 4,
         other => {
-            let message = format!("elements of type {other:?}, expected \"|u1\" or \"<f4\"");
+            let message = format!("elements of type {other:?}, expected \"|u1\", \"<u2\" or \"<f4\"");
             return Err(Error::new(ErrorKind::Unsupported, message));
         }
     };
@@ -234,6 +249,7 @@ fn read_array(entry: &mut impl Read, size: u64) -> Result<(Vec<usize>, OwnedElem
     }
     let elements = match item {
         1 => OwnedElements::U8(bytes),
+        2 => OwnedElements::U16(bytes.as_chunks().0.iter().map(|&b| u16::from_le_bytes(b)).collect()),
         _ => OwnedElements::F32(bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()),
     };
     Ok((shape, elements))

@@ -7,7 +7,6 @@ use std::io;
 #[cfg(any(feature = "npz", feature = "images"))]
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU32, Ordering};
 
 /// Writes `path` through a temporary file beside it, which takes its name once all bytes are down.
 ///
@@ -45,19 +44,19 @@ impl Replacement {
         let Some(name) = target.file_name() else {
             return Err(Error::new(ErrorKind::Io, "cannot write: the path names no file").in_file(path));
         };
-        static NEXT: AtomicU32 = AtomicU32::new(0);
-        loop {
+        // Another thread's file, or one left by a killed process of the same id, is there already: take the next number.
+        for number in 0u32.. {
             let mut temporary = OsString::from(".");
             temporary.push(name);
-            temporary.push(format!(".{}-{}.tmp", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed)));
+            temporary.push(format!(".{}-{}.tmp", std::process::id(), number));
             let temporary = target.with_file_name(temporary);
             match OpenOptions::new().write(true).create_new(true).open(&temporary) {
                 Ok(file) => return Ok(Self { file, temporary, target, done: false }),
-                // Left by a process of the same id that was killed: take the next number.
                 Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {}
                 Err(e) => return Err(Error::io(path, "write", &e)),
             }
         }
+        Err(Error::new(ErrorKind::Io, "cannot write: no temporary name is free").in_file(path))
     }
 
     /// Gives the file its name once its bytes are on disk.

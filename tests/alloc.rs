@@ -12,6 +12,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicIsize, AtomicUsize, Ordering};
 use std::time::Duration;
 use voxcast::graph::Rewrites;
+use voxcast::rig::RigBuilder;
 use voxcast::weights::Precision;
 use voxcast::{Budget, ImageView, Isa, Model, Network, Rig, Session, SessionOptions, Step, Threads};
 
@@ -74,7 +75,7 @@ fn held<R>(work: impl FnOnce() -> R) -> (R, isize, usize) {
 }
 
 /// Queues that grow by blocks would show after some dozens of frames.
-const FRAMES: usize = 200;
+const FRAMES: usize = 100;
 
 #[test]
 fn everything_is_allocated_when_a_session_is_made_and_known_before() {
@@ -85,7 +86,6 @@ fn everything_is_allocated_when_a_session_is_made_and_known_before() {
     let mut network = small::network();
     network.image = [32, 64];
     network.grids = [[8, 12, 4], [4, 6, 2], [2, 3, 1]];
-    let rigs = [0.3, 1.0].map(|turn| small::rig(&network, turn));
     let images = Images::new(&network, 5);
     let images = images.views();
     for (precision, rewrites) in [(Precision::F32, Rewrites::ALL), (Precision::F16, Rewrites::NONE)] {
@@ -103,20 +103,23 @@ fn everything_is_allocated_when_a_session_is_made_and_known_before() {
             // What a thread still frees of its own start is not the session's.
             options.threads.broadcast(|| ());
             let promised = Session::memory(&model, 2, &options).unwrap();
-            let make = || Session::new(model.clone(), rigs[0].clone(), &options).unwrap();
+            let own = small::rig(&network, 0.3);
+            let make = || Session::new(model.clone(), own.clone(), &options).unwrap();
             let (first, bytes, calls) = held(make);
             let (mut session, again, calls_again) = held(make);
             assert_eq!(bytes, promised.total() as isize, "{promised:?} on {threads} threads, {precision:?}");
             assert_eq!((again, calls_again), (bytes, calls), "a session takes the same each time");
             assert_eq!(first.taken(), promised);
-            drop(first);
+            drop((first, own));
             session.run(&images).unwrap();
             let mut occupied = 0;
-            let mut spare = Some(rigs[1].clone());
+            let mut calibration = Calibration::new(&network, &options.threads);
+            // Rig, spare and builder have memory each, which must once have held every calibration.
+            (0..6).for_each(|turn| calibration.swap(&mut session, turn));
             let found = counted(|| {
                 for frame in 0..FRAMES {
                     occupied += session.run(&images).unwrap().classes.iter().filter(|&&c| c != 0).count();
-                    spare = spare.take().map(|spare| control(&mut session, spare, &images, frame));
+                    control(&mut session, &mut calibration, &images, frame);
                 }
             });
             assert!(occupied > 0);
@@ -137,17 +140,38 @@ fn opening_takes_the_same_each_time(network: &Network, precision: Precision, rew
 }
 
 /// A frame as a controller makes it: one camera's image, steps, another rig, a mask.
-fn control(session: &mut Session, spare: Arc<Rig>, images: &[ImageView<'_>], frame: usize) -> Arc<Rig> {
+fn control(session: &mut Session, calibration: &mut Calibration, images: &[ImageView<'_>], frame: usize) {
     session.set_camera(frame % 2, images[frame % 2]).unwrap();
     let budget = if frame % 3 == 0 { Budget::Time(Duration::from_micros(500)) } else { Budget::Slices(40) };
     for _ in 0..3 {
         session.step(budget);
     }
-    let replaced = session.set_rig(spare).unwrap();
+    calibration.swap(session, frame);
     session.set_masked(1, frame % 4 == 0).unwrap();
     while session.step(budget) == Step::Running {}
     let mut bits = [0; 4096];
     let result = session.occupancy().unwrap();
     result.write_bits(&mut bits[..result.bits_len()]);
-    replaced
+}
+
+/// A rig that is built in steps while another is in use.
+struct Calibration {
+    builder: RigBuilder,
+    spare: Arc<Rig>,
+    matrices: [Vec<[f32; 16]>; 2],
+}
+
+impl Calibration {
+    fn new(network: &Network, threads: &Threads) -> Self {
+        let builder = RigBuilder::new(network, 2, Isa::best()).unwrap().with_threads(threads.clone());
+        let matrices = [0.3, 1.0].map(|turn| small::lidar2img(network, turn));
+        Self { builder, spare: small::rig(network, 0.5), matrices }
+    }
+
+    fn swap(&mut self, session: &mut Session, turn: usize) {
+        self.builder.begin(&self.matrices[turn % 2]).unwrap();
+        let rig = Arc::get_mut(&mut self.spare).expect("a rig that no session uses");
+        while !self.builder.advance(20, rig).unwrap() {}
+        self.spare = session.set_rig(self.spare.clone()).unwrap();
+    }
 }

@@ -218,6 +218,20 @@ fn the_whole_path() {
     for (class, count) in summary["counts"].as_array().unwrap().iter().enumerate() {
         assert_eq!(count.as_u64().unwrap() as usize, classes.iter().filter(|&&c| usize::from(c) == class).count());
     }
+    assert_eq!((arrays[2].name.as_str(), &arrays[2].shape[..]), ("support", &[16, 24, 8][..]));
+    let support = |out: &str| match read_npz(Path::new(out)).unwrap().pop().unwrap().elements {
+        OwnedElements::U16(support) => support,
+        other => panic!("support is u16, not {other:?}"),
+    };
+    let all = support(&out);
+    assert!(all.contains(&0) && all.iter().any(|&n| n > 1), "seen and unseen places");
+    let masked = run(&["--mask", "1"]);
+    assert_ne!(masked["digest"], summary["digest"]);
+    let fewer = support(&out);
+    assert!(fewer.iter().zip(&all).all(|(a, b)| a <= b) && fewer != all);
+    assert_eq!(run(&["--mask", "CAM_1"])["digest"], masked["digest"], "by name");
+    run(&["--mask", "0,1"]);
+    assert!(support(&out).iter().all(|&n| n == 0));
     let png = place.text("out.png");
     for more in [
         &["--threads", "1"][..],
@@ -250,6 +264,7 @@ fn the_whole_path() {
     let profile = done(&["profile", "--model", &model, &scene, "--repeat", "1", "--json", "--trace", &trace]);
     let profile: Value = serde_json::from_str(&profile).unwrap();
     assert!(profile["rows"].as_array().unwrap().len() > 50);
+    assert!(profile["longest_slice_seconds"].as_f64() > Some(0.0) && profile["slices"].as_u64() > Some(100));
     serde_json::from_slice::<Value>(&fs::read(&trace).unwrap()).unwrap();
     for by in ["part", "kind", "operation"] {
         assert!(done(&["profile", "--model", &model, &scene, "--repeat", "1", "--by", by]).contains("GMAC/s"));
@@ -332,7 +347,8 @@ fn files_that_are_not_there() {
     refused(&scene, &["rig", &scene, "--model", &model, "-o", &scene]);
 
     let missing = place.text("no/such/out");
-    refused(&missing, &["run", "--model", &model, &scene, "-o", &missing]);
+    // Before the frame, not after it: the model is not even looked for.
+    refused(&missing, &["run", "--model", &nothing, &scene, "-o", &missing]);
     refused(&missing, &["run", "--model", &model, &scene, "-o", &out, "--png", &missing]);
     refused(&missing, &["import", &weights, "--network", &net, "-o", &missing]);
     refused(&missing, &["rig", &scene, "--model", &model, "-o", &missing]);
@@ -358,6 +374,8 @@ fn names_and_numbers_that_are_unknown() {
     assert!(line.contains("scalar, avx2"), "{line}");
     let line = refused("no stage", &["run", "--model", &model, &scene, "-o", &out, "--dump", &dump, "--stages", "c9"]);
     assert!(line.contains("\"c9\"") && line.contains("logits.lvl0"), "{line}");
+    let line = refused(&scene, &["run", "--model", &model, &scene, "-o", &out, "--mask", "0,2"]);
+    assert!(line.contains("camera \"2\"") && line.contains("CAM_0, CAM_1"), "{line}");
     // The wrong published network for these weights.
     let line = refused(&weights, &["import", &weights, "--network", "nuscenes-200", "-o", &out]);
     assert!(line.contains("img_backbone.") && line.contains("expects"), "{line}");

@@ -4,7 +4,7 @@ use super::Machine;
 use std::path::Path;
 use std::sync::Arc;
 use voxcast::rig::RigBuilder;
-use voxcast::{Error, Model, Result, Rig, Scene, Session, SessionOptions};
+use voxcast::{Error, ErrorKind, Model, Result, Rig, Scene, Session, SessionOptions};
 
 /// Calibration of a scene directory, of its calibration.json alone, or of a scene file.
 pub fn calibration(path: &Path) -> Result<Vec<[f32; 16]>> {
@@ -14,6 +14,16 @@ pub fn calibration(path: &Path) -> Result<Vec<[f32; 16]>> {
         return Ok(cameras.into_iter().map(|c| c.lidar2img).collect());
     }
     Ok(Scene::open(path)?.lidar2img)
+}
+
+/// Refuses a place that cannot be written, before a long computation rather than after.
+pub fn check_output(path: &Path) -> Result<()> {
+    let directory = path.parent().filter(|d| !d.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    match std::fs::metadata(directory) {
+        Ok(metadata) if metadata.is_dir() && !path.is_dir() => Ok(()),
+        Ok(_) => Err(Error::new(ErrorKind::Io, "cannot write: not a regular file in a directory").in_file(path)),
+        Err(e) => Err(Error::io(path, "write", &e)),
+    }
 }
 
 /// The rig from its file, or built from the scene's calibration.

@@ -2,21 +2,26 @@
 
 use super::{Machine, frame, terminal};
 use clap::Args;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use voxcast::graph::{Graph, Op};
-use voxcast::session::views;
-use voxcast::{Error, Isa, Result, Threads};
+use voxcast::session::{Event, views};
+use voxcast::{Budget, Error, ImageView, Isa, Result, Session, Step, Threads};
 
-/// Time every operation of a model on a scene: median, multiply-adds per second, and the share of this machine's own
-/// peak, which is measured between the frames.
+/// Time every operation of a model on a scene: median, multiply-adds per second, the share of this machine's own peak,
+/// which is measured between the frames, and the longest slice when the frame is run in steps.
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Examples:
   voxcast profile --model model.safetensors scene/
   voxcast profile --model model.safetensors scene/ --repeat 5 --by kind
-  voxcast profile --model model.safetensors scene/ --trace trace.json    (open in chrome://tracing or Perfetto)")]
+  voxcast profile --model model.safetensors scene/ --slice 20 --by part    (how long can one step take?)
+  voxcast profile --model model.safetensors scene/ --trace trace.json    (open in chrome://tracing or Perfetto)
+
+A step of a controller overruns its time by one slice at most. The column `slice` is the longest of each row, over as many
+frames as are timed, the line at the end the longest of all. On a shared machine, it holds what others did meanwhile.")]
 pub struct Profile {
     /// The model
     #[arg(long)]
@@ -35,6 +40,9 @@ pub struct Profile {
     /// Run without the projection fold
     #[arg(long)]
     unfolded: bool,
+    /// Work in one slice of a step, in million multiply-adds; a slice is at least one tile for each thread
+    #[arg(long, value_name = "MILLIONS", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
+    slice: u32,
     /// Write the last frame as a Chrome trace
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
@@ -49,7 +57,17 @@ pub struct Profile {
 struct Row {
     name: String,
     seconds: Vec<f64>,
+    /// Of the longest slice.
+    slice: f64,
     multiply_adds: u64,
+}
+
+/// Frames in slices.
+struct Sliced {
+    /// Seconds of the longest slice of each operation.
+    longest: Vec<f64>,
+    /// Slices of a frame.
+    slices: usize,
 }
 
 impl Profile {
@@ -57,18 +75,19 @@ impl Profile {
         let (model, scene) = frame::open(&self.model, &self.scene)?;
         let mut options = frame::options(&self.machine)?;
         options.unfolded = self.unfolded;
+        options.slice_cost = u64::from(self.slice) * 1_000_000;
         let rig = Arc::new(frame::rig(self.rig.as_deref(), &model, &scene, &options)?);
         let mut session = frame::session(&model, rig, &options)?;
         let graph = session.graph().clone();
         let images = views(&scene);
-        let index_of: std::collections::BTreeMap<&str, usize> =
+        let index_of: BTreeMap<&str, usize> =
             graph.operations.iter().enumerate().map(|(i, o)| (o.name.as_str(), i)).collect();
         let repeat = usize::from(self.repeat);
         let mut seconds = vec![vec![0.0f64; repeat + 1]; graph.operations.len()];
         let mut peaks = vec![];
         let mut frames = vec![];
         let mut trace = vec![];
-        let bar = terminal::progress("profiling", repeat + 1);
+        let bar = terminal::progress("profiling", 2 * repeat + 1);
         for round in 0..=repeat {
             peaks.push(peak(options.isa, &options.threads));
             trace.clear();
@@ -81,19 +100,26 @@ impl Profile {
             frames.push(start.elapsed().as_secs_f64());
             bar.inc(1);
         }
+        let mut sliced = Sliced { longest: vec![0.0; graph.operations.len()], slices: 0 };
+        for _ in 0..repeat {
+            sliced.frame(&mut session, &images, &index_of)?;
+            bar.inc(1);
+        }
         bar.finish_and_clear();
         if let Some(path) = &self.trace {
             write_trace(path, &graph, &trace)?;
         }
         let peak = median(&mut peaks[1..]);
         let frame = median(&mut frames[1..]);
-        let rows = self.rows(&graph, &seconds, images.len());
-        self.print(rows, frame, peak, options.threads.count());
+        let rows = self.rows(&graph, &seconds, &sliced, images.len());
+        let worst = (0..sliced.longest.len()).max_by(|&a, &b| sliced.longest[a].total_cmp(&sliced.longest[b]));
+        let worst = worst.map_or("", |index| &graph.operations[index].name);
+        self.print(rows, frame, peak, options.threads.count(), sliced.slices, worst);
         Ok(())
     }
 
     /// Table rows in running order.
-    fn rows(&self, graph: &Graph, seconds: &[Vec<f64>], cameras: usize) -> Vec<Row> {
+    fn rows(&self, graph: &Graph, seconds: &[Vec<f64>], sliced: &Sliced, cameras: usize) -> Vec<Row> {
         let mut rows: Vec<Row> = vec![];
         for (i, operation) in graph.operations.iter().enumerate() {
             let name = match self.by.as_str() {
@@ -103,34 +129,46 @@ impl Profile {
             };
             let times = if i < graph.camera_operations { cameras as u64 } else { 1 };
             let work = graph.multiply_adds(operation) * times;
+            let slice = sliced.longest[i];
             match rows.iter_mut().find(|r| r.name == name) {
                 Some(row) => {
                     row.multiply_adds += work;
+                    row.slice = row.slice.max(slice);
                     row.seconds.iter_mut().zip(&seconds[i][1..]).for_each(|(sum, s)| *sum += s);
                 }
-                None => rows.push(Row { name, seconds: seconds[i][1..].to_vec(), multiply_adds: work }),
+                None => rows.push(Row { name, seconds: seconds[i][1..].to_vec(), slice, multiply_adds: work }),
             }
         }
         rows
     }
 
-    fn print(&self, rows: Vec<Row>, frame: f64, peak: f64, threads: usize) {
-        let rows: Vec<_> = rows.into_iter().map(|mut r| (r.name, median(&mut r.seconds), r.multiply_adds)).collect();
-        let total: u64 = rows.iter().map(|r| r.2).sum();
+    fn print(&self, rows: Vec<Row>, frame: f64, peak: f64, threads: usize, slices: usize, worst: &str) {
+        let total: u64 = rows.iter().map(|r| r.multiply_adds).sum();
+        let longest = rows.iter().map(|r| r.slice).fold(0.0, f64::max);
+        let rows: Vec<_> =
+            rows.into_iter().map(|mut r| (r.name, median(&mut r.seconds), r.slice, r.multiply_adds)).collect();
         if self.json {
             let rows: Vec<_> = rows
                 .iter()
-                .map(|(name, s, work)| serde_json::json!({"name": name, "seconds": s, "multiply_adds": work}))
+                .map(|(name, s, slice, work)| {
+                    serde_json::json!({
+                        "name": name, "seconds": s, "longest_slice_seconds": slice, "multiply_adds": work,
+                    })
+                })
                 .collect();
             let value = serde_json::json!({
                 "frame_seconds": frame, "peak_multiply_adds_per_second": peak, "threads": threads,
-                "multiply_adds": total, "rows": rows,
+                "multiply_adds": total, "rows": rows, "slices": slices,
+                "longest_slice_seconds": longest, "longest_slice_operation": worst,
             });
             println!("{value:#}");
             return;
         }
-        println!("{:58} {:>10} {:>6} {:>9} {:>9} {:>6}", self.by, "median", "share", "GMAC", "GMAC/s", "peak");
-        for (name, s, work) in &rows {
+        println!(
+            "{:58} {:>10} {:>6} {:>9} {:>9} {:>6} {:>10}",
+            self.by, "median", "share", "GMAC", "GMAC/s", "peak", "slice"
+        );
+        for (name, s, slice, work) in &rows {
             let rate = *work as f64 / s;
             let (gmac, rate, share) = if *work == 0 {
                 (String::new(), String::new(), String::new())
@@ -139,9 +177,10 @@ impl Profile {
                 (gmac, format!("{:.1}", rate / 1e9), format!("{:.0} %", 100.0 * rate / peak))
             };
             println!(
-                "{name:58} {:>10} {:>5.1}% {gmac:>9} {rate:>9} {share:>6}",
+                "{name:58} {:>10} {:>5.1}% {gmac:>9} {rate:>9} {share:>6} {:>10}",
                 terminal::time(Duration::from_secs_f64(*s)),
-                100.0 * s / frame
+                100.0 * s / frame,
+                terminal::time(Duration::from_secs_f64(*slice))
             );
         }
         println!(
@@ -152,6 +191,34 @@ impl Profile {
             100.0 * total as f64 / frame / peak,
             peak / 1e9
         );
+        println!(
+            "in steps: {slices} slices of about {} million multiply-adds, the longest {} in {worst}",
+            self.slice,
+            terminal::time(Duration::from_secs_f64(longest))
+        );
+    }
+}
+
+impl Sliced {
+    /// Runs a frame slice by slice.
+    fn frame(
+        &mut self,
+        session: &mut Session,
+        images: &[ImageView<'_>],
+        index_of: &BTreeMap<&str, usize>,
+    ) -> Result<()> {
+        for (camera, image) in images.iter().enumerate() {
+            session.set_camera(camera, *image)?;
+        }
+        self.slices = 1;
+        let mut observe = |event: Event<'_>| {
+            let longest = &mut self.longest[index_of[event.operation.name.as_str()]];
+            *longest = longest.max(event.longest.as_secs_f64());
+        };
+        while session.step_observed(Budget::Slices(1), &mut observe) == Step::Running {
+            self.slices += 1;
+        }
+        Ok(())
     }
 }
 

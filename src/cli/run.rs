@@ -3,6 +3,7 @@
 use super::dump::Dump;
 use super::{Machine, frame, terminal};
 use clap::Args;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -10,7 +11,7 @@ use voxcast::npz::{Array, Elements, write_npz};
 use voxcast::picture::{self, Figure, Palette};
 use voxcast::scene::forward_of;
 use voxcast::session::{Occupancy, views};
-use voxcast::{Network, Result, Scene};
+use voxcast::{Error, Network, Result, Scene};
 
 /// Run a model on a scene and write the class of every voxel.
 #[derive(Args, Debug)]
@@ -18,9 +19,11 @@ use voxcast::{Network, Result, Scene};
 Examples:
   voxcast run --model model.safetensors scene/ -o out.npz
   voxcast run --model model.safetensors --rig rig.safetensors scene/ -o out.npz --logits --png out.png
+  voxcast run --model model.safetensors scene/ -o out.npz --mask CAM_BACK,2
   voxcast run --model model.safetensors scene/ -o out.npz --dump stages/ --stages level1.volume,logits.lvl0
 
-In Python: numpy.load('out.npz')['classes'] is u8 [X, Y, Z].
+In Python: numpy.load('out.npz')['classes'] is u8 [X, Y, Z], and ['support'] u16 [X, Y, Z] says by how many feature
+pixels each voxel is seen: where it is 0, no camera sees the place, and its class is a guess. Pictures hatch such places.
 Without --rig the matrices are built from the scene's calibration before the frame.
 The digest is the XXH3-64 of the classes; it is the same on any number of threads and any instruction set.")]
 pub struct Run {
@@ -32,7 +35,7 @@ pub struct Run {
     rig: Option<PathBuf>,
     /// A scene directory or .safetensors
     scene: PathBuf,
-    /// The .npz to write: `classes` u8 [X, Y, Z]
+    /// The .npz to write: `classes` u8 and `support` u16, both [X, Y, Z]
     #[arg(short, long, value_name = "OUT.npz")]
     output: PathBuf,
     /// Also write `logits` f32 [X, Y, Z, K]
@@ -41,6 +44,9 @@ pub struct Run {
     /// Draw images, bird's-eye view and voxels
     #[arg(long, value_name = "FILE")]
     png: Option<PathBuf>,
+    /// Leave cameras out, by name or number from 0, separated by commas: as if the rig had them not
+    #[arg(long, value_name = "CAMERAS", value_delimiter = ',')]
+    mask: Vec<String>,
     /// Write stages of the network to DIR/stages.safetensors, channels first
     #[arg(long, value_name = "DIR")]
     dump: Option<PathBuf>,
@@ -61,6 +67,9 @@ pub struct Run {
 impl Run {
     pub fn run(self) -> Result<()> {
         let start = Instant::now();
+        for path in [Some(&self.output), self.png.as_ref()].into_iter().flatten() {
+            frame::check_output(path)?;
+        }
         let (model, scene) = frame::open(&self.model, &self.scene)?;
         let mut dump = self.dump.as_ref().map(|_| Dump::new(self.stages.as_deref(), model.network())).transpose()?;
         let mut options = frame::options(&self.machine)?;
@@ -75,8 +84,14 @@ impl Run {
         let rig_time = start.elapsed();
         let mut session = frame::session(&model, rig.clone(), &options)?;
 
+        let masked = masked(&self.mask, &scene).map_err(|e| e.in_file(&self.scene))?;
+        for &camera in &masked {
+            session.set_masked(camera, true)?;
+        }
+
         let graph = session.graph().clone();
-        let total = graph.camera_operations * scene.cameras() + graph.operations.len() - graph.camera_operations;
+        let total = graph.camera_operations * (scene.cameras() - masked.len()) + graph.operations.len()
+            - graph.camera_operations;
         let bar = terminal::progress("running", total);
         let start = Instant::now();
         let mut dumping = Duration::ZERO;
@@ -105,6 +120,18 @@ impl Run {
     }
 }
 
+/// The cameras that `names` are, each once.
+fn masked(names: &[String], scene: &Scene) -> Result<BTreeSet<usize>> {
+    let find = |name: &String| {
+        let number = || name.parse().ok().filter(|&camera| camera < scene.cameras());
+        scene.names.iter().position(|n| n == name).or_else(number).ok_or_else(|| {
+            let known = scene.names.join(", ");
+            Error::mismatch(format!("--mask names camera {name:?}, the scene has {known}"))
+        })
+    };
+    names.iter().map(find).collect()
+}
+
 /// A model's file name without its ending.
 fn title(model: &Path) -> String {
     model.file_stem().unwrap_or_default().to_string_lossy().into_owned()
@@ -118,6 +145,7 @@ pub fn write(path: &Path, network: &Network, result: &Occupancy<'_>, logits: boo
     if let Some(values) = result.logits.filter(|_| logits) {
         arrays.push(Array { name: "logits", shape: &shape, elements: Elements::F32(values) });
     }
+    arrays.push(Array { name: "support", shape: &shape[..3], elements: Elements::U16(result.support) });
     write_npz(path, &arrays)
 }
 
@@ -131,7 +159,8 @@ pub fn draw(
 ) -> Result<picture::Picture> {
     let palette = Palette::of(network.classes);
     let occupancy =
-        picture::Occupancy::new("", result.classes, result.grid, network.bounds, forward_of(&network.bounds))?;
+        picture::Occupancy::new("", result.classes, result.grid, network.bounds, forward_of(&network.bounds))?
+            .with_support(result.support)?;
     let images: Vec<_> = scene.names.iter().map(String::as_str).zip(&scene.images).collect();
     Ok(picture::draw(&Figure { title, subtitle, images: &images, occupancies: &[occupancy], palette: &palette }))
 }

@@ -11,6 +11,7 @@ fn write_sample(path: &Path) {
         Array { name: "classes", shape: &[2, 3, 2], elements: Elements::U8(&[0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 255]) },
         Array { name: "logits", shape: &[6], elements: Elements::F32(&f) },
         Array { name: "scalar", shape: &[], elements: Elements::F32(&f[2..3]) },
+        Array { name: "support", shape: &[3], elements: Elements::U16(&[0, 258, 65535]) },
         Array { name: "none", shape: &[0, 4], elements: Elements::U8(&[]) },
     ];
     write_npz(path, &arrays).unwrap();
@@ -34,7 +35,11 @@ fn round_trip_keeps_names_order_shapes_and_bits() {
     write_sample(&path);
     let arrays = read_npz(&path).unwrap();
     let names: Vec<_> = arrays.iter().map(|a| (a.name.as_str(), a.shape.as_slice())).collect();
-    assert_eq!(names, [("classes", &[2, 3, 2][..]), ("logits", &[6]), ("scalar", &[]), ("none", &[0, 4])]);
+    assert_eq!(
+        names,
+        [("classes", &[2, 3, 2][..]), ("logits", &[6]), ("scalar", &[]), ("support", &[3]), ("none", &[0, 4])]
+    );
+    assert_eq!(arrays[3].elements, OwnedElements::U16(vec![0, 258, 65535]));
     assert_eq!(arrays[0].elements, OwnedElements::U8(vec![0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 255]));
     let OwnedElements::F32(found) = &arrays[1].elements else { panic!("expected floats") };
     let bits = |v: &[f32]| v.iter().map(|f| f.to_bits()).collect::<Vec<_>>();

@@ -14,6 +14,12 @@ const EMPTY: Rgb = [247, 248, 250];
 
 const INK: Rgb = [38, 42, 48];
 
+/// Pixels from one line of the hatching to the next, along a row.
+const HATCH: usize = 9;
+
+/// What places that no camera sees are mixed with, between the hatching's lines and on them.
+const HATCH_TONES: [Rgb; 2] = [[232, 234, 238], [150, 155, 163]];
+
 /// How the map lies on the grid: grid axes that point up and right on it, and whether they point along growing indices.
 struct Orientation {
     up: usize,
@@ -75,6 +81,8 @@ pub(crate) fn draw(canvas: &mut Canvas, rect: Rect, occupancy: &Occupancy<'_>, p
 struct Column {
     /// Light of its colour.
     colour: Vec3,
+    /// Whether what is shown, or all of an empty column, is seen by no camera.
+    unseen: bool,
     /// One bit for each side (-x, +x, -y, +y) on which a pale class ends: drawn as a line, so that it shows on the page.
     outline: u8,
 }
@@ -126,7 +134,12 @@ fn columns(grid: &Grid, palette: &Palette) -> Vec<Column> {
                     outline |= u8::from(pale && class(i, j) != class(x, y)) << side;
                 }
             }
-            columns.push(Column { colour: base * tone, outline });
+            let first = (x * ny + y) * nz;
+            let unseen = match h {
+                0 => (first..first + nz).all(|i| grid.is_unseen(i)),
+                h => grid.is_unseen(first + h - 1),
+            };
+            columns.push(Column { colour: base * tone, unseen, outline });
         }
     }
     columns
@@ -145,6 +158,7 @@ fn pixels(grid: &Grid, o: &Orientation, columns: &[Column], w: usize, h: usize) 
         let pixels = if axis == o.right { w } else { h };
         (1.5 * grid.size[axis] as f32 / pixels as f32).min(0.25)
     });
+    let hatch = HATCH_TONES.map(|tone| Vec3::from_array(tone.map(light)));
     let mut rgb = Vec::with_capacity(w * h * 3);
     for row in 0..h {
         for column in 0..w {
@@ -154,7 +168,11 @@ fn pixels(grid: &Grid, o: &Orientation, columns: &[Column], w: usize, h: usize) 
                 at[o.right] = locate(o.right, o.right_grows, column * SAMPLES + s % SAMPLES, w * SAMPLES);
                 at[o.up] = locate(o.up, !o.up_grows, row * SAMPLES + s / SAMPLES, h * SAMPLES);
                 let [(x, u), (y, v)] = at;
-                let Column { colour, outline } = columns[x * grid.size[1] + y];
+                let Column { mut colour, unseen, outline } = columns[x * grid.size[1] + y];
+                if unseen {
+                    let line = (column + row) % HATCH < HATCH / 3;
+                    colour = colour.lerp(hatch[usize::from(line)], if line { 0.60 } else { 0.35 });
+                }
                 let near = [u < line[0], u > 1.0 - line[0], v < line[1], v > 1.0 - line[1]];
                 let lined = (0..4).any(|side| near[side] && outline >> side & 1 == 1);
                 sum += if lined { colour * 0.30 } else { colour };

@@ -10,6 +10,8 @@ const LIDAR_HEIGHT: f32 = 1.8;
 pub(crate) struct Grid {
     /// Class of each voxel; 0 where nothing is drawn.
     pub(crate) cells: Vec<u8>,
+    /// Whether no camera sees a voxel; empty if that is not known.
+    unseen: Vec<bool>,
     pub(crate) size: [usize; 3],
     /// Corner of voxel (0, 0, 0) in metres.
     pub(crate) low: Vec3,
@@ -35,6 +37,7 @@ impl Grid {
     pub(crate) fn new(occupancy: &Occupancy<'_>, palette: &Palette) -> Self {
         let size = occupancy.grid;
         let cells: Vec<u8> = occupancy.classes.iter().map(|&c| if palette.is_drawn(c) { c } else { 0 }).collect();
+        let unseen = (0..occupancy.support.len()).map(|i| occupancy.is_unseen(i)).collect();
         let layers = cells.chunks_exact(size[2]);
         let top = layers.filter_map(|column| column.iter().rposition(|&c| c != 0)).max().map_or(0, |z| z + 1);
         let bounds = occupancy.bounds;
@@ -43,7 +46,7 @@ impl Grid {
         let step = (axis(1) - low) / Vec3::from_array(size.map(|n| n as f32));
         let ahead = Vec3::new(occupancy.forward[0], occupancy.forward[1], 0.0);
         let sun = (left_of(ahead) * 0.52 - ahead * 0.40 + Vec3::Z * 0.82).normalize();
-        let mut grid = Self { cells, size, low, step, ahead, top, sun, sunlit: Vec::new() };
+        let mut grid = Self { cells, unseen, size, low, step, ahead, top, sun, sunlit: Vec::new() };
         grid.sunlit = grid.find_sunlit();
         grid
     }
@@ -99,6 +102,11 @@ impl Grid {
             }
         }
         sunlit
+    }
+
+    /// Whether it is known that no camera sees voxel `index`.
+    pub(crate) fn is_unseen(&self, index: usize) -> bool {
+        self.unseen.get(index) == Some(&true)
     }
 
     pub(crate) fn high(&self) -> Vec3 {

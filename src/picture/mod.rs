@@ -49,6 +49,7 @@ pub struct Occupancy<'a> {
     grid: [usize; 3],
     bounds: [[f32; 2]; 3],
     forward: [f32; 2],
+    support: &'a [u16],
 }
 
 impl<'a> Occupancy<'a> {
@@ -93,7 +94,26 @@ impl<'a> Occupancy<'a> {
         if !(length.is_finite() && length > 1e-6) {
             return Err(Error::format(format!("forward direction {forward:?}, expected finite numbers, not both 0")));
         }
-        Ok(Self { caption, classes, grid, bounds, forward: [(fx / length) as f32, (fy / length) as f32] })
+        let forward = [(fx / length) as f32, (fy / length) as f32];
+        Ok(Self { caption, classes, grid, bounds, forward, support: &[] })
+    }
+
+    /// The same with the number of pixels that see each voxel: places that no camera sees are hatched on the map and pale
+    /// in the 3-D view.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Mismatch`] when `support` has not as many numbers as the grid has voxels.
+    pub fn with_support(self, support: &'a [u16]) -> Result<Self> {
+        if support.len() != self.classes.len() {
+            let message = format!("{} support counts, expected {}", support.len(), self.classes.len());
+            return Err(Error::mismatch(message));
+        }
+        Ok(Self { support, ..self })
+    }
+
+    /// Whether it is known that no camera sees voxel `index`.
+    fn is_unseen(&self, index: usize) -> bool {
+        self.support.get(index) == Some(&0)
     }
 }
 
@@ -251,7 +271,8 @@ fn note(occupancy: &Occupancy<'_>, palette: &Palette) -> String {
     let bare = occupancy.classes.chunks_exact(z).filter(|column| !column.iter().any(|&c| palette.is_drawn(c))).count();
     // The lines lie under the voxels: where these cover the ground there is nothing to explain.
     let lines = if bare * 20 > x * y { format!("; lines every {} m", voxels::PLATE_LINES) } else { String::new() };
-    format!("{x} × {y} × {z} voxels of {size}, {} occupied{lines}", legend::thousands(occupied))
+    let unseen = if occupancy.support.contains(&0) { "; hatched and pale: seen by no camera" } else { "" };
+    format!("{x} × {y} × {z} voxels of {size}, {} occupied{unseen}{lines}", legend::thousands(occupied))
 }
 
 fn draw_heading(canvas: &mut Canvas, fonts: &Fonts, top: usize, title: &str, subtitle: &[String]) {

@@ -51,6 +51,21 @@ fn occupancy_that_is_none_is_refused() {
 }
 
 #[test]
+fn places_that_no_camera_sees_look_otherwise() {
+    let classes = vec![4u8; 90];
+    let grid = [6, 5, 3];
+    let blue = |picture: &Picture| picture.rgb.chunks_exact(3).filter(|p| p[2] > 150 && p[0] < 60).count();
+    let all = figure_of(&[], &[occupancy(&classes, grid)], 17);
+    let seen = figure_of(&[], &[occupancy(&classes, grid).with_support(&[7; 90]).unwrap()], 17);
+    assert_eq!(digest(&all), digest(&seen), "seen everywhere");
+    let mut support = [1; 90];
+    support[45..].fill(0);
+    let half = figure_of(&[], &[occupancy(&classes, grid).with_support(&support).unwrap()], 17);
+    assert!((1..blue(&all) * 7 / 10).contains(&blue(&half)), "{} of {}", blue(&half), blue(&all));
+    assert_eq!(occupancy(&classes, grid).with_support(&[1; 89]).unwrap_err().kind(), ErrorKind::Mismatch);
+}
+
+#[test]
 fn empty_and_full_grids_and_pages_without_parts_are_drawn() {
     let grid = [6, 5, 3];
     for fill in [0u8, 4, 200] {
@@ -109,10 +124,14 @@ proptest! {
     ) {
         let mut random = crate::random::Random::new(seed);
         let cells: Vec<u8> = (0..grid.iter().product::<usize>()).map(|_| random.next_u64() as u8 % 48).collect();
+        let support: Vec<u16> = cells.iter().map(|_| random.next_u64() as u16 % 3).collect();
         let images: Vec<Image> = (0..cameras).map(|k| image(sides[0] + k, sides[1], k)).collect();
         let images: Vec<(&str, &Image)> = images.iter().map(|i| ("CAM_X", i)).collect();
         let bounds = std::array::from_fn(|k| [low[k], low[k] + size[k]]);
-        let occupancies: Vec<_> = Occupancy::new("any", &cells, grid, bounds, forward).into_iter().collect();
+        let occupancies: Vec<_> = Occupancy::new("any", &cells, grid, bounds, forward)
+            .and_then(|o| if seed % 2 == 0 { o.with_support(&support) } else { Ok(o) })
+            .into_iter()
+            .collect();
         let picture = figure_of(&images, &occupancies, classes);
         prop_assert_eq!(picture.rgb.len(), picture.width * picture.height * 3);
     }

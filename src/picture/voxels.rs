@@ -25,6 +25,9 @@ const PLATE: Vec3 = Vec3::new(0.885, 0.893, 0.905);
 /// Metres between the plate's lines.
 pub(crate) const PLATE_LINES: f32 = 10.0;
 
+/// What voxels that no camera sees are mixed with.
+const UNSEEN: [u8; 3] = [226, 229, 234];
+
 /// Share of the light that comes from the sky; the sun gives a level surface the rest.
 const SKY: f32 = 0.46;
 
@@ -391,9 +394,14 @@ impl Shader<'_> {
         };
         let mut normal = Vec3::ZERO;
         normal[usize::from(face.side / 2)] = if face.side % 2 == 1 { 1.0 } else { -1.0 };
+        let colour = self.colours[usize::from(self.grid.cells[face.voxel as usize])];
         Surface {
             seen: self.view.see(&patch(self.grid, face), w, h),
-            colour: self.colours[usize::from(self.grid.cells[face.voxel as usize])],
+            colour: if self.grid.is_unseen(face.voxel as usize) {
+                colour.lerp(Vec3::from_array(UNSEEN.map(light)), 0.65)
+            } else {
+                colour
+            },
             normal,
             corners: std::array::from_fn(|k| 1.0 - 0.15 * f32::from((face.corners >> (2 * k)) & 3)),
             edges: face.edges,

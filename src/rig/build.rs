@@ -210,8 +210,17 @@ impl RigBuilder {
         }
         let points = self.levels.iter().map(|l| self.cameras * l.points()).max().unwrap_or(0);
         let pixels = self.levels.iter().map(|l| self.cameras * l.pixels).max().unwrap_or(0);
+        // Which thread gets the largest slab is chance: what one has needed, all have, so that none grows in a later build.
+        let most = |a: [usize; 2], b: [usize; 2]| [a[0].max(b[0]), a[1].max(b[1])];
+        let mut room = [[0; 2]; 2];
         for scratch in &mut self.scratch {
-            scratch.get_mut().unwrap_or_else(PoisonError::into_inner).reserve(points, pixels)?;
+            let rows = scratch.get_mut().unwrap_or_else(PoisonError::into_inner).rows();
+            room = [most(room[0], rows[0].room()), most(room[1], rows[1].room())];
+        }
+        for scratch in &mut self.scratch {
+            let scratch = scratch.get_mut().unwrap_or_else(PoisonError::into_inner);
+            scratch.reserve(points, pixels)?;
+            scratch.rows().into_iter().zip(room).try_for_each(|(rows, room)| rows.grow_to(room))?;
         }
         for (level, views) in self.levels.iter().zip(&mut self.views) {
             views.clear();
@@ -417,6 +426,10 @@ impl Rows {
 }
 
 impl Scratch {
+    fn rows(&mut self) -> [&mut Growing; 2] {
+        [&mut self.volume_rows, &mut self.bev_rows]
+    }
+
     fn reserve(&mut self, points: usize, pixels: usize) -> Result<()> {
         if points > self.points.len() {
             self.points.try_reserve_exact(points - self.points.len()).map_err(out_of_memory)?;

@@ -25,6 +25,18 @@ impl Growing {
         self.used = 0;
     }
 
+    /// Becomes empty, with room for so many rows and entries.
+    pub(super) fn grow_to(&mut self, [rows, entries]: [usize; 2]) -> Result<()> {
+        self.clear();
+        self.ends.try_reserve_exact(rows).map_err(out_of_memory)?;
+        self.reserve(entries)
+    }
+
+    /// Rows and entries that there is room for.
+    pub(super) fn room(&self) -> [usize; 2] {
+        [self.ends.capacity(), self.col.len()]
+    }
+
     /// Room for `more` entries.
     pub(super) fn reserve(&mut self, more: usize) -> Result<()> {
         let needed = self.used + more;
