@@ -27,6 +27,8 @@ use voxcast_kernels::{Isa, Panels};
 const CONV_ROWS: usize = 96;
 /// Rows that the product kernel computes at once.
 const CONV_TILE: usize = 6;
+/// Numbers in the image rows or volume planes that one worker computes at a time, at least.
+const LINES: usize = 1 << 14;
 /// Voxels or cells that one worker gathers at a time.
 const GATHER_ROWS: usize = 500;
 /// Voxels that one worker classifies at a time.
@@ -418,7 +420,8 @@ impl Executor {
         kernel: &LinesKernel<'_>,
     ) -> Next {
         let line = self.range(operation.output, call.camera).len() / lines;
-        let per_tile = lines.div_ceil(8 * self.plan.workers()).max(1);
+        // Small tiles, so that a slice can be short; but enough work in each to be worth handing out.
+        let per_tile = LINES.div_ceil(line.max(1)).min(lines.div_ceil(8 * self.plan.workers())).max(1);
         self.pieces(view, operation, call, per_tile * line, &|tile, out, scratch| {
             let first = tile * per_tile;
             kernel(first..first + out.len() / line, out, scratch);
