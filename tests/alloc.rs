@@ -142,12 +142,12 @@ fn opening_takes_the_same_each_time(network: &Network, precision: Precision, rew
 /// A frame as a controller makes it: one camera's image, steps, another rig, a mask.
 fn control(session: &mut Session, calibration: &mut Calibration, images: &[ImageView<'_>], frame: usize) {
     session.set_camera(frame % 2, images[frame % 2]).unwrap();
-    let budget = if frame % 3 == 0 { Budget::Time(Duration::from_micros(500)) } else { Budget::Slices(40) };
+    let budget = if frame.is_multiple_of(3) { Budget::Time(Duration::from_micros(500)) } else { Budget::Slices(40) };
     for _ in 0..3 {
         session.step(budget);
     }
     calibration.swap(session, frame);
-    session.set_masked(1, frame % 4 == 0).unwrap();
+    session.set_masked(1, frame.is_multiple_of(4)).unwrap();
     while session.step(budget) == Step::Running {}
     let mut bits = [0; 4096];
     let result = session.occupancy().unwrap();

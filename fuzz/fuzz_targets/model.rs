@@ -10,7 +10,7 @@ use std::sync::Arc;
 use voxcast::random::Random;
 use voxcast::rig::RigBuilder;
 use voxcast::{Isa, Model, Session, SessionOptions};
-use voxcast_fuzz::{images, sealed, views};
+use voxcast_fuzz::{data_len, images, sealed, views};
 
 /// Bytes of weights to make up for one input.
 const MAX_DATA: usize = 1 << 20;
@@ -18,16 +18,6 @@ const MAX_DATA: usize = 1 << 20;
 const MAX_WORK: u64 = 1 << 24;
 const MAX_MEMORY: usize = 1 << 25;
 const MAX_POINTS: usize = 1 << 16;
-
-/// Bytes of data that the header ends with, as far as they can be guessed.
-fn data_len(header: &[u8]) -> usize {
-    const KEY: &[u8] = b"\"data_offsets\":[";
-    let Some(at) = header.windows(KEY.len()).rposition(|w| w == KEY) else { return 0 };
-    let pair = &header[at + KEY.len()..];
-    let number = pair.split(|&b| b == b',').nth(1).unwrap_or_default();
-    let digits: String = number.iter().take_while(|b| b.is_ascii_digit()).map(|&b| char::from(b)).collect();
-    digits.parse().unwrap_or(0)
-}
 
 /// Weights of a kind: zeros, ones, drawn, any bits at all.
 fn data(kind: u8, len: usize) -> Vec<u8> {

@@ -1,5 +1,7 @@
 //! What the targets share: the smallest network, its model, and containers around fuzzed contents.
 
+pub mod differential;
+
 use std::sync::{Arc, OnceLock};
 use voxcast::import::import;
 use voxcast::model::Options;
@@ -64,6 +66,16 @@ pub fn sealed(header: &[u8], data: &[u8]) -> Vec<u8> {
 pub fn split(file: &[u8]) -> (&[u8], &[u8]) {
     let length = u64::from_le_bytes(file[..8].try_into().expect("eight bytes")) as usize;
     (&file[8..8 + length], &file[8 + length..])
+}
+
+/// Bytes of data that the header ends with, as far as they can be guessed.
+pub fn data_len(header: &[u8]) -> usize {
+    const KEY: &[u8] = b"\"data_offsets\":[";
+    let Some(at) = header.windows(KEY.len()).rposition(|w| w == KEY) else { return 0 };
+    let pair = &header[at + KEY.len()..];
+    let number = pair.split(|&b| b == b',').nth(1).unwrap_or_default();
+    let digits: String = number.iter().take_while(|b| b.is_ascii_digit()).map(|&b| char::from(b)).collect();
+    digits.parse().unwrap_or(0)
 }
 
 /// Camera images of drawn bytes.

@@ -11,8 +11,8 @@
 //! needs none: its rows lie in memory already.
 
 use crate::isa::Isa;
-use crate::product::{DEPTH, Linear, PIECES, Product, Source, product};
-use crate::simd::{Kernel, Simd, dispatch};
+use crate::product::{DEPTH, PIECES, Product, Rows, Source};
+use crate::simd::Simd;
 use std::ops::Range;
 
 /// How a convolution walks its input. The axes are depth, height, width.
@@ -96,54 +96,7 @@ pub struct Conv<'a> {
 pub fn conv(isa: Isa, args: &Conv<'_>, rows: Range<usize>, stride: usize, out: &mut [f32], scratch: &mut [f32]) {
     args.geometry.check(args.input);
     assert_eq!(args.product.depth, args.geometry.depth(), "the weights belong to another kernel");
-    args.product.check_rows(&rows, args.geometry.rows(), stride, out, scratch);
-    dispatch(isa, Run { args, rows, stride, out, scratch });
-}
-
-struct Run<'a> {
-    args: &'a Conv<'a>,
-    rows: Range<usize>,
-    stride: usize,
-    out: &'a mut [f32],
-    scratch: &'a mut [f32],
-}
-
-impl Kernel for Run<'_> {
-    type Output = ();
-
-    fn reference(self) {
-        let first = self.rows.start;
-        for row in self.rows {
-            for n in 0..self.args.product.columns {
-                let out = &mut self.out[(row - first) * self.stride + n];
-                *out = self.args.product.reference(row, n, *out, |k| self.args.element(row, k));
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn run<S: Simd>(self, s: S) {
-        let target = Linear { first: self.rows.start, stride: self.stride };
-        product(s, &self.args.product, self.args, &target, self.rows, self.out, self.scratch);
-    }
-}
-
-impl Conv<'_> {
-    /// Element `k` of the virtual left matrix's row `row`.
-    pub(crate) fn element(&self, row: usize, k: usize) -> f32 {
-        let g = &self.geometry;
-        let (tap, c) = (k / g.channels, k % g.channels);
-        let tap = [tap / (g.kernel[1] * g.kernel[2]), tap / g.kernel[2] % g.kernel[1], tap % g.kernel[2]];
-        let mut at = 0;
-        for axis in 0..3 {
-            let x = g.position(row)[axis] * g.stride[axis] + tap[axis] * g.dilation[axis];
-            if x < g.padding[axis] || x - g.padding[axis] >= g.input[axis] {
-                return 0.0;
-            }
-            at = at * g.input[axis] + x - g.padding[axis];
-        }
-        self.input[at * g.channels + c]
-    }
+    Rows { product: &args.product, source: args, rows, stride, out, scratch }.compute(isa, args.geometry.rows());
 }
 
 /// A stretch of k: taps of the last axis, as far as they are contiguous in memory, or more than one such stretch where
@@ -218,6 +171,23 @@ impl Conv<'_> {
 impl Source for Conv<'_> {
     type At = [usize; 3];
     type Part = Stretch;
+
+    #[inline(always)]
+    fn element(&self, row: usize, k: usize) -> f32 {
+        let g = &self.geometry;
+        let (tap, c) = (k / g.channels, k % g.channels);
+        let tap = [tap / (g.kernel[1] * g.kernel[2]), tap / g.kernel[2] % g.kernel[1], tap % g.kernel[2]];
+        let position = g.position(row);
+        let mut at = 0;
+        for axis in 0..3 {
+            let x = position[axis] * g.stride[axis] + tap[axis] * g.dilation[axis];
+            if x < g.padding[axis] || x - g.padding[axis] >= g.input[axis] {
+                return 0.0;
+            }
+            at = at * g.input[axis] + x - g.padding[axis];
+        }
+        self.input[at * g.channels + c]
+    }
 
     #[inline(always)]
     fn at(&self, row: usize) -> [usize; 3] {

@@ -16,14 +16,14 @@
 use crate::conv::Geometry;
 use crate::isa::Isa;
 use crate::math::sigmoid;
-use crate::product::{DEPTH, Linear, Product, Source, product};
-use crate::simd::{Kernel, LANES, Simd, dispatch};
+use crate::product::{DEPTH, Product, Rows, Source};
+use crate::simd::{LANES, Simd};
 use std::ops::Range;
 
 /// A deformable convolution's arguments.
 #[derive(Clone, Copy, Debug)]
 pub struct DeformConv2d<'a> {
-    /// How the undeformed convolution walks its input; depth axes are 1.
+    /// How the undeformed convolution walks its input; extents of the depth axis are 1, its padding 0.
     pub geometry: Geometry,
     /// `[height, width, channels]`.
     pub input: &'a [f32],
@@ -53,11 +53,11 @@ pub fn deform_conv2d(
 ) {
     let g = &args.geometry;
     g.check(args.input);
-    assert!([g.input[0], g.output[0], g.kernel[0]] == [1; 3], "a deformable convolution is two-dimensional");
+    let flat = [g.input[0], g.output[0], g.kernel[0]] == [1; 3] && g.padding[0] == 0;
+    assert!(flat, "a deformable convolution is two-dimensional");
     assert_eq!(args.product.depth, g.depth(), "the weights belong to another kernel");
     assert_eq!(args.offsets.len(), g.rows() * 3 * args.taps(), "the offsets belong to another kernel");
-    args.product.check_rows(&rows, g.rows(), stride, out, scratch);
-    dispatch(isa, Run { args, rows, stride, out, scratch });
+    Rows { product: &args.product, source: args, rows, stride, out, scratch }.compute(isa, g.rows());
 }
 
 /// Where one tap of one output samples: the first channel of each corner, and its weight.
@@ -105,8 +105,14 @@ impl DeformConv2d<'_> {
         ];
         Some(Sample { corners: corners.map(|c| c.0), weights: corners.map(|c| c.1) })
     }
+}
 
-    /// Element `k` of the virtual left matrix's row `row`.
+impl Source for DeformConv2d<'_> {
+    /// The row and its position in the output.
+    type At = (usize, [usize; 3]);
+    type Part = usize;
+
+    #[inline(always)]
     fn element(&self, row: usize, k: usize) -> f32 {
         let c = k % self.geometry.channels;
         let Some(Sample { corners, weights }) = self.sample(self.at(row), k / self.geometry.channels) else {
@@ -118,12 +124,6 @@ impl DeformConv2d<'_> {
         }
         value
     }
-}
-
-impl Source for DeformConv2d<'_> {
-    /// The row and its position in the output.
-    type At = (usize, [usize; 3]);
-    type Part = usize;
 
     #[inline(always)]
     fn at(&self, row: usize) -> Self::At {
@@ -181,34 +181,6 @@ fn blend<S: Simd>(s: S, corners: [&[f32]; 4], weights: [f32; 4], out: &mut [f32]
 fn mix<S: Simd>(s: S, [a, b, c, d]: [S::V; 4], weights: [S::V; 4]) -> S::V {
     let value = s.mul_add(weights[1], b, s.mul(weights[0], a));
     s.mul_add(weights[3], d, s.mul_add(weights[2], c, value))
-}
-
-struct Run<'a> {
-    args: &'a DeformConv2d<'a>,
-    rows: Range<usize>,
-    stride: usize,
-    out: &'a mut [f32],
-    scratch: &'a mut [f32],
-}
-
-impl Kernel for Run<'_> {
-    type Output = ();
-
-    fn reference(self) {
-        let first = self.rows.start;
-        for row in self.rows {
-            for n in 0..self.args.product.columns {
-                let out = &mut self.out[(row - first) * self.stride + n];
-                *out = self.args.product.reference(row, n, *out, |k| self.args.element(row, k));
-            }
-        }
-    }
-
-    #[inline(always)]
-    fn run<S: Simd>(self, s: S) {
-        let target = Linear { first: self.rows.start, stride: self.stride };
-        product(s, &self.args.product, self.args, &target, self.rows, self.out, self.scratch);
-    }
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@
 //! Stride 1, zero padding k/2, so the output has the shape of the input. The sum is one chain of fused multiply-adds
 //! that starts at the bias; taps outside count as in = 0 and stay in the chain; the residual joins last.
 //!
-//! The body runs sixteen channels at a time and, where no tap leaves the row, four neighbouring columns, which
+//! The body runs sixteen channels at a time and, where no tap leaves the row, four or eight neighbouring columns, which
 //! share each load of weights. Neither touches the order of a chain.
 
 use crate::isa::Isa;
@@ -17,6 +17,8 @@ use std::ops::Range;
 
 /// Columns that are computed together: 8 accumulators of 8 lanes leave registers for weights and inputs.
 const BLOCK: usize = 4;
+/// The same with 32 registers: as many accumulators, of 16 lanes.
+const WIDE_BLOCK: usize = 8;
 
 /// A depthwise convolution's arguments.
 #[derive(Clone, Copy, Debug)]
@@ -74,6 +76,7 @@ struct Run<'a> {
 impl Kernel for Run<'_> {
     type Output = ();
 
+    #[inline(always)]
     fn reference(self) {
         let a = self.args;
         let padded = a.channels.next_multiple_of(LANES);
@@ -102,13 +105,19 @@ impl Kernel for Run<'_> {
             let mut x = 0;
             while x < a.width {
                 let pixels = &mut out[x * a.channels..];
-                if x >= half && x + BLOCK + half <= a.width {
-                    a.columns::<S, BLOCK>(s, y, x, &mut pixels[..BLOCK * a.channels]);
-                    x += BLOCK;
-                } else {
-                    a.columns::<S, 1>(s, y, x, &mut pixels[..a.channels]);
-                    x += 1;
+                // Columns from here on, no tap of which leaves the row.
+                let inside = if x >= half { a.width.saturating_sub(x + half) } else { 0 };
+                macro_rules! columns {
+                    ($n:expr) => {{
+                        a.columns::<S, { $n }>(s, y, x, &mut pixels[..$n * a.channels]);
+                        $n
+                    }};
                 }
+                x += match inside {
+                    WIDE_BLOCK.. if S::WIDE => columns!(WIDE_BLOCK),
+                    BLOCK.. => columns!(BLOCK),
+                    _ => columns!(1),
+                };
             }
         }
     }
@@ -175,7 +184,9 @@ impl Depthwise<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{Fill, Rng, assert_close, assert_lively, assert_same_bits, pad_rows};
+    use crate::testing::{
+        Fill, Rng, assert_close, assert_lively, assert_order_shows, assert_same_bits, pad_rows, reverse_rows,
+    };
     use proptest::prelude::*;
 
     struct Case {
@@ -228,8 +239,8 @@ mod tests {
         }
     }
 
-    /// Channels around 16, widths around the kernel and the block.
-    const SHAPES: [([usize; 3], usize); 9] = [
+    /// Channels around 16, widths around the kernel and the blocks; the last has one of each.
+    const SHAPES: [([usize; 3], usize); 10] = [
         ([1, 1, 16], 3),
         ([3, 7, 1], 3),
         ([2, 6, 5], 5),
@@ -239,6 +250,7 @@ mod tests {
         ([3, 13, 17], 7),
         ([6, 8, 33], 3),
         ([4, 12, 64], 5),
+        ([2, 17, 19], 3),
     ];
 
     #[test]
@@ -273,13 +285,27 @@ mod tests {
         fn any_shape_gives_the_scalar_bits(
             h in 1usize..6, w in 1usize..14, c in 1usize..40, half in 0usize..4, residual: bool, seed: u64,
         ) {
-            let case = Case::new([h, w, c], 2 * half + 1, residual, seed, Rng::wide);
+            let case = Case::new([h, w, c], 2 * half + 1, residual, seed, Rng::fill_of(seed));
             let want = case.all(Isa::Scalar);
             for isa in Isa::available() {
                 assert_same_bits(&case.all(isa), &want, "whole");
                 let split = h / 2;
                 assert_same_bits(&[case.rows(isa, 0..split), case.rows(isa, split..h)].concat(), &want, "split");
             }
+        }
+    }
+
+    #[test]
+    fn the_order_of_a_chain_shows() {
+        for (shape, kernel) in SHAPES.into_iter().filter(|(shape, kernel)| *kernel > 1 && shape[0] > 1) {
+            let c = shape[2];
+            let mut case = Case::new(shape, kernel, false, 7, Rng::ordinary);
+            case.weights = pad_rows(&Rng::new(8).ordinary(kernel * kernel * c), c, 0.0);
+            let want = case.all(Isa::Scalar);
+            // Half a turn of image and kernel turns the output, and the order of the taps.
+            case.input = reverse_rows(&case.input, c);
+            case.weights = reverse_rows(&case.weights, c.next_multiple_of(LANES));
+            assert_order_shows(&reverse_rows(&case.all(Isa::Scalar), c), &want, &format!("{shape:?}, kernel {kernel}"));
         }
     }
 

@@ -13,7 +13,7 @@ const LN2_LO: f32 = -1.904_654_3e-9;
 const EXP_POLY: [f32; 8] = [1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0];
 
 /// e^x within 2 ulp on [-87, 88], clamped outside. NaN gives NaN.
-#[inline]
+#[inline(always)]
 pub fn exp(x: f32) -> f32 {
     let x = if x < EXP_MIN { EXP_MIN } else { x };
     let x = if x > EXP_MAX { EXP_MAX } else { x };
@@ -27,7 +27,7 @@ pub fn exp(x: f32) -> f32 {
 }
 
 /// 1 / (1 + e^-x).
-#[inline]
+#[inline(always)]
 pub fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + exp(-x))
 }
@@ -57,6 +57,7 @@ mod tests {
 
     impl Kernel for Exp<'_> {
         type Output = ();
+        #[inline(always)]
         fn reference(self) {
             self.0.iter_mut().for_each(|x| *x = exp(*x));
         }

@@ -80,6 +80,7 @@ struct Run<'a> {
 impl Kernel for Run<'_> {
     type Output = ();
 
+    #[inline(always)]
     fn reference(self) {
         let a = self.args;
         let [_, width] = a.output();
@@ -201,7 +202,7 @@ mod tests {
         ) {
             let padding = (seed % kernel as u64) as usize;
             prop_assume!(h.min(w) + 2 * padding >= kernel);
-            let input = Rng::new(seed).wide(h * w * c);
+            let input = Rng::fill_of(seed)(&mut Rng::new(seed), h * w * c);
             let args = args(&input, [h, w, c], [kernel, stride, padding]);
             let want = all(Isa::Scalar, &args);
             let height = args.output()[0];

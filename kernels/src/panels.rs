@@ -33,12 +33,12 @@ impl Panels<'_> {
         self.len() == 0
     }
 
-    /// The number at packed position `i`, widened. For the specification; bodies read whole panels.
-    #[inline]
-    pub fn get(&self, i: usize) -> f32 {
+    /// The 16 numbers from packed position `i` on, widened. For the specification; bodies read whole panels.
+    #[inline(always)]
+    pub(crate) fn lanes(&self, i: usize) -> [f32; LANES] {
         match self {
-            Panels::F32(w) => w[i],
-            Panels::F16(w) => w[i].to_f32(),
+            Panels::F32(w) => *w[i..].first_chunk().expect("panels are whole"),
+            Panels::F16(w) => w[i..].first_chunk::<LANES>().expect("panels are whole").map(f16::to_f32),
         }
     }
 }
@@ -90,9 +90,13 @@ mod tests {
 
     #[test]
     fn both_precisions_are_read_as_stored() {
-        let (wide, narrow) = ([1.5, -0.25], [f16::from_f32(1.5), f16::from_f32(-0.25)]);
+        let wide: [f32; 17] = std::array::from_fn(|i| 1.5 - i as f32);
+        let narrow = wide.map(f16::from_f32);
         for panels in [Panels::F32(&wide), Panels::F16(&narrow)] {
-            assert_eq!((panels.len(), panels.get(0), panels.get(1)), (2, 1.5, -0.25));
+            assert_eq!(
+                (panels.len(), panels.lanes(0), panels.lanes(1)),
+                (17, wide[..16].try_into().unwrap(), wide[1..].try_into().unwrap())
+            );
             assert!(!panels.is_empty());
         }
         assert!(Panels::F32(&[]).is_empty() && Panels::F16(&[]).is_empty());
@@ -102,8 +106,9 @@ mod tests {
 
     impl Kernel for Widen<'_> {
         type Output = ();
+        #[inline(always)]
         fn reference(self) {
-            *self.1 = std::array::from_fn(|i| Panels::F16(self.0).get(i));
+            *self.1 = Panels::F16(self.0).lanes(0);
         }
         #[inline(always)]
         fn run<S: Simd>(self, s: S) {

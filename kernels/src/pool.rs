@@ -54,6 +54,7 @@ struct Run<'a> {
 impl Kernel for Run<'_> {
     type Output = ();
 
+    #[inline(always)]
     fn reference(self) {
         for (c, out) in self.out.iter_mut().enumerate() {
             let mut sum = 0.0;
@@ -93,7 +94,7 @@ pub fn broadcast(row: &[f32], stride: usize, offset: usize, out: &mut [f32]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{Fill, Rng, assert_close, assert_lively, assert_same_bits};
+    use crate::testing::{Fill, Rng, assert_close, assert_lively, assert_order_shows, assert_same_bits, reverse_rows};
     use proptest::prelude::*;
 
     fn run(isa: Isa, input: &[f32], channels: usize) -> Vec<f32> {
@@ -133,7 +134,7 @@ mod tests {
     proptest! {
         #[test]
         fn any_shape_gives_the_scalar_bits(rows in 1usize..50, channels in 1usize..70, seed: u64) {
-            let input = Rng::new(seed).wide(rows * channels);
+            let input = Rng::fill_of(seed)(&mut Rng::new(seed), rows * channels);
             let want = run(Isa::Scalar, &input, channels);
             for isa in Isa::available() {
                 assert_same_bits(&run(isa, &input, channels), &want, "mean");
@@ -155,6 +156,13 @@ mod tests {
                 prop_assert_eq!(new, *want.unwrap_or(&old));
             }
         }
+    }
+
+    #[test]
+    fn the_order_of_a_sum_shows() {
+        let input = Rng::new(7).ordinary(50 * 33);
+        let reversed = reverse_rows(&input, 33);
+        assert_order_shows(&run(Isa::Scalar, &reversed, 33), &run(Isa::Scalar, &input, 33), "rows");
     }
 
     #[test]

@@ -8,24 +8,29 @@
 //! samples) only those that lie nowhere in this order. The right matrix is packed ([`crate::panels`]).
 //!
 //! What the body changes relative to the formula, none of which can change a bit:
-//! 1. Rows go in blocks of `ROWS`, k in blocks of `DEPTH`. Between k blocks the partial sums wait in `out`, and the
-//!    next block's chain starts from them.
-//! 2. Inside, tiles of `TILE` rows by 16 columns live in registers: 12 accumulators of 8 lanes, 2 registers of
-//!    weights and broadcasts of `a`. That is the largest tile that AVX2's 16 registers hold without spilling.
-//! 3. One packed panel of a k block (at most 24 KiB) stays in the first-level cache while all tiles of the row block use it;
-//!    they fetch the next one, a share each, and the outputs of the tile that follows.
+//! 1. Rows go in blocks of `ROWS`, k in blocks of at most `DEPTH`. Between k blocks the partial sums wait in `out`, and
+//!    the next block's chain starts from them.
+//! 2. Inside, a tile lives in registers. With AVX2 it is 6 rows by 16 columns: 12 accumulators of 8 lanes, 2 registers of
+//!    weights and broadcasts of `a`, the most that 16 registers hold without spilling. With AVX-512 it is 12 rows by 32
+//!    columns: 24 accumulators of 16 lanes, 2 registers of weights; each broadcast serves two multiply-adds, so that
+//!    loads do not limit the speed.
+//! 3. The packed panels of a tile and k block (at most 24 KiB) stay in the first-level cache while all tiles of the row
+//!    block use them; they fetch the next ones, a share each, and the outputs of the tile that follows.
 //! 4. Half-precision weights are widened once per panel, k block and row block.
 
-use crate::panels::Panels;
-use crate::simd::{LANES, Simd, relu};
+use crate::isa::Isa;
+use crate::panels::{Panels, packed_index};
+use crate::simd::{Kernel, LANES, Simd, dispatch, relu};
 use half::f16;
 use std::ops::Range;
 
-/// Rows of a tile.
+/// Rows of a tile in 16 registers.
 const TILE: usize = 6;
+/// Rows of a tile in 32 registers, which also has two panels.
+const WIDE_TILE: usize = 12;
 /// Rows of a block: with `DEPTH` numbers each they take under a third of a 512 KiB second-level cache.
 pub(crate) const ROWS: usize = 96;
-/// Most numbers of k per block: a packed panel of them takes three quarters of a 32 KiB first-level cache.
+/// Most numbers of k per block, for all panels of a tile together: a packed panel of them takes three quarters of a 32 KiB first-level cache.
 pub(crate) const DEPTH: usize = 384;
 /// Distance between the rows of a block. The extra 16 keep rows from falling into the same cache set.
 const STRIDE: usize = DEPTH + LANES;
@@ -99,25 +104,37 @@ impl Product<'_> {
         assert!(out.len() >= span(rows.len(), stride, self.columns), "the output is shorter than its rows");
     }
 
-    /// The specification of one output: `a(k)` is the left row, `out` the number there before the call, `row` the row
-    /// in the residual's tensor.
-    pub(crate) fn reference(&self, row: usize, n: usize, out: f32, a: impl Fn(usize) -> f32) -> f32 {
-        let mut sum = self.bias[n];
-        match self.residual {
-            Residual::InPlace => sum += out,
-            Residual::Before { rows, stride } => sum += rows[row * stride + n],
-            _ => {}
+    /// The specification of row `row`: `a(k)` is the left row, `out` holds the outputs and before that whatever was
+    /// there, `residual_row` is the row in the residual's tensor.
+    ///
+    /// Sixteen chains advance side by side, so that an element of the left row is looked up once for all.
+    #[inline(always)]
+    pub(crate) fn reference(&self, residual_row: usize, out: &mut [f32], a: impl Fn(usize) -> f32) {
+        let added = |rows: &[f32], stride: usize, n: usize| rows[residual_row * stride + n];
+        for (panel, out) in out.chunks_mut(LANES).enumerate() {
+            let column = panel * LANES;
+            let mut sums = [0.0; LANES];
+            for (i, out) in out.iter().enumerate() {
+                sums[i] = self.bias[column + i];
+                match self.residual {
+                    Residual::InPlace => sums[i] += out,
+                    Residual::Before { rows, stride } => sums[i] += added(rows, stride, column + i),
+                    _ => {}
+                }
+            }
+            for k in 0..self.depth {
+                let (x, weights) = (a(k), self.weights.lanes(packed_index(self.depth, k, column)));
+                for (sum, weight) in sums.iter_mut().zip(weights) {
+                    *sum = x.mul_add(weight, *sum);
+                }
+            }
+            for (i, out) in out.iter_mut().enumerate() {
+                *out = if self.relu { relu(sums[i]) } else { sums[i] };
+                if let Residual::After { rows, stride } = self.residual {
+                    *out += added(rows, stride, column + i);
+                }
+            }
         }
-        for k in 0..self.depth {
-            sum = a(k).mul_add(self.weights.get(crate::panels::packed_index(self.depth, k, n)), sum);
-        }
-        if self.relu {
-            sum = relu(sum);
-        }
-        if let Residual::After { rows, stride } = self.residual {
-            sum += rows[row * stride + n];
-        }
-        sum
     }
 }
 
@@ -133,6 +150,8 @@ pub(crate) trait Source {
     /// What is known of a piece of k before its elements are asked for.
     type Part: Copy;
 
+    /// Element `k` of row `row`, for the specification.
+    fn element(&self, row: usize, k: usize) -> f32;
     /// Row `row`.
     fn at(&self, row: usize) -> Self::At;
     /// The row after `at`.
@@ -219,6 +238,53 @@ impl Pieces {
     }
 }
 
+/// A product whose output rows go one after the other: what a convolution is.
+pub(crate) struct Rows<'a, A> {
+    pub(crate) product: &'a Product<'a>,
+    pub(crate) source: &'a A,
+    pub(crate) rows: Range<usize>,
+    /// Distance between rows of `out`, which starts at the first of them.
+    pub(crate) stride: usize,
+    pub(crate) out: &'a mut [f32],
+    pub(crate) scratch: &'a mut [f32],
+}
+
+impl<A: Source> Rows<'_, A> {
+    /// Computes the rows, of `total`, on `isa`.
+    ///
+    /// # Panics
+    /// As [`Product::check_rows`].
+    #[inline]
+    pub(crate) fn compute(self, isa: Isa, total: usize) {
+        self.product.check_rows(&self.rows, total, self.stride, self.out, self.scratch);
+        dispatch(isa, self);
+    }
+}
+
+impl<A: Source> Kernel for Rows<'_, A> {
+    type Output = ();
+
+    #[inline(always)]
+    fn reference(self) {
+        let first = self.rows.start;
+        for row in self.rows {
+            let out = &mut self.out[(row - first) * self.stride..][..self.product.columns];
+            self.product.reference(
+                row,
+                out,
+                #[inline(always)]
+                |k| self.source.element(row, k),
+            );
+        }
+    }
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let target = Linear { first: self.rows.start, stride: self.stride };
+        product(s, self.product, self.source, &target, self.rows, self.out, self.scratch);
+    }
+}
+
 /// Computes `rows` of the product. `scratch` must hold [`SCRATCH`] numbers.
 #[inline(always)]
 pub(crate) fn product<S: Simd, A: Source, T: Target>(
@@ -231,8 +297,10 @@ pub(crate) fn product<S: Simd, A: Source, T: Target>(
     scratch: &mut [f32],
 ) {
     let (block, widened) = scratch[..SCRATCH].split_at_mut(ROWS * STRIDE);
+    let panels = p.columns.div_ceil(LANES);
     // Equal k blocks, as few as possible.
-    let step = p.depth.div_ceil(p.depth.div_ceil(DEPTH).max(1)).next_multiple_of(LANES);
+    let most = if S::WIDE && panels >= 2 { DEPTH / 2 } else { DEPTH };
+    let step = p.depth.div_ceil(p.depth.div_ceil(most).max(1)).next_multiple_of(LANES);
     let mut pieces = Pieces::new();
     let mut offsets = [0; ROWS];
     let mut first = rows.start;
@@ -245,58 +313,122 @@ pub(crate) fn product<S: Simd, A: Source, T: Target>(
         let mut k = 0;
         loop {
             let depth = pieces.find(s, source, at, count, k..p.depth.min(k + step), block);
-            let ends = Ends { first: k == 0, last: k + depth == p.depth };
-            let panels = p.columns.div_ceil(LANES);
-            for panel in 0..panels {
-                let start = (panel * p.depth + k) * LANES;
-                let weights = match p.weights {
-                    Panels::F32(w) => &w[start..start + depth * LANES],
-                    Panels::F16(w) => widen(s, &w[start..start + depth * LANES], widened),
-                };
-                // The panel that is needed next, as far as there is one, in equal shares per tile.
-                let share = (depth * LANES).div_ceil(count.div_ceil(TILE)).next_multiple_of(LANES);
-                let mut ahead = match p.weights {
-                    Panels::F32(w) if panel + 1 < panels => w[start + p.depth * LANES..].as_ptr(),
-                    _ => std::ptr::null(),
-                };
-                let mut i = 0;
-                while i < count {
-                    if !ahead.is_null() {
-                        for line in (0..share).step_by(LANES) {
-                            s.prefetch(ahead.wrapping_add(line));
-                        }
-                        ahead = ahead.wrapping_add(share);
-                    }
-                    for &offset in &offsets[(i + TILE).min(count)..(i + 2 * TILE).min(count)] {
-                        s.prefetch(out.as_ptr().wrapping_add(offset + panel * LANES));
-                    }
-                    let tile = Tile { p, ends, row: first + i, panel, weights, pieces: &pieces, i };
-                    macro_rules! rows {
-                        ($n:literal) => {
-                            if p.columns - panel * LANES >= LANES {
-                                tile.run::<S, T, $n, true>(s, target, &offsets, out)
-                            } else {
-                                tile.run::<S, T, $n, false>(s, target, &offsets, out)
-                            }
-                        };
-                    }
-                    match count - i {
-                        1 => rows!(1),
-                        2 => rows!(2),
-                        3 => rows!(3),
-                        4 => rows!(4),
-                        5 => rows!(5),
-                        _ => rows!(6),
-                    }
-                    i += TILE;
+            let block = Block {
+                p,
+                ends: Ends { first: k == 0, last: k + depth == p.depth },
+                row: first,
+                offsets: &offsets[..count],
+                k,
+                depth,
+                pieces: &pieces,
+            };
+            let mut panel = 0;
+            while panel < panels {
+                if S::WIDE && panels - panel >= 2 {
+                    block.panels::<S, T, 2>(s, target, panel, widened, out);
+                    panel += 2;
+                } else {
+                    block.panels::<S, T, 1>(s, target, panel, widened, out);
+                    panel += 1;
                 }
             }
             k += depth;
-            if ends.last {
+            if k == p.depth {
                 break;
             }
         }
         first += count;
+    }
+}
+
+/// A block of rows in a k block.
+struct Block<'a, 'p> {
+    p: &'a Product<'p>,
+    ends: Ends,
+    /// The first row in the whole product.
+    row: usize,
+    /// Where the rows are in `out`.
+    offsets: &'a [usize],
+    k: usize,
+    depth: usize,
+    pieces: &'a Pieces,
+}
+
+impl Block<'_, '_> {
+    /// All rows of `P` panels from `panel` on.
+    #[inline(always)]
+    fn panels<S: Simd, T: Target, const P: usize>(
+        &self,
+        s: S,
+        target: &T,
+        panel: usize,
+        widened: &mut [f32],
+        out: &mut [f32],
+    ) {
+        let (p, len, count) = (self.p, self.depth * LANES, self.offsets.len());
+        let start = |panel: usize| (panel * p.depth + self.k) * LANES;
+        let mut weights = [&[][..]; P];
+        for (j, widened) in widened.chunks_exact_mut(DEPTH / P * LANES).take(P).enumerate() {
+            weights[j] = match p.weights {
+                Panels::F32(w) => &w[start(panel + j)..][..len],
+                Panels::F16(w) => widen(s, &w[start(panel + j)..][..len], widened),
+            };
+        }
+        // The panels that are needed next, as far as there are any, in equal shares per tile.
+        let most = if S::WIDE { WIDE_TILE } else { TILE };
+        let share = len.div_ceil(count.div_ceil(most)).next_multiple_of(LANES);
+        let mut ahead = [std::ptr::null(); P];
+        for (j, ahead) in ahead.iter_mut().enumerate() {
+            if let Panels::F32(w) = p.weights
+                && (panel + P + j) * LANES < p.columns
+            {
+                *ahead = w[start(panel + P + j)..].as_ptr();
+            }
+        }
+        let mut i = 0;
+        while i < count {
+            for ahead in ahead.iter_mut().filter(|ahead| !ahead.is_null()) {
+                for line in (0..share).step_by(LANES) {
+                    s.prefetch(ahead.wrapping_add(line));
+                }
+                *ahead = ahead.wrapping_add(share);
+            }
+            for &offset in &self.offsets[(i + most).min(count)..(i + 2 * most).min(count)] {
+                for j in 0..P {
+                    s.prefetch(out.as_ptr().wrapping_add(offset + (panel + j) * LANES));
+                }
+            }
+            let tile = Tile { block: self, panel, weights, i };
+            let whole = p.columns - panel * LANES >= P * LANES;
+            macro_rules! rows {
+                ($n:expr) => {{
+                    // A mask that lets everything pass costs nothing, so AVX-512 needs no code of its own for it.
+                    if S::WIDE || !whole {
+                        tile.run::<S, T, { $n }, false>(s, target, out)
+                    } else {
+                        tile.run::<S, T, { $n }, true>(s, target, out)
+                    }
+                    $n
+                }};
+            }
+            i += if S::WIDE {
+                match count - i {
+                    WIDE_TILE.. => rows!(WIDE_TILE),
+                    6.. => rows!(6),
+                    3.. => rows!(3),
+                    _ => rows!(1),
+                }
+            } else {
+                match count - i {
+                    TILE.. => rows!(TILE),
+                    5 => rows!(5),
+                    4 => rows!(4),
+                    3 => rows!(3),
+                    2 => rows!(2),
+                    _ => rows!(1),
+                }
+            };
+        }
     }
 }
 
@@ -318,73 +450,70 @@ struct Ends {
     last: bool,
 }
 
-/// Up to six rows of one panel in one k block.
-struct Tile<'a, 'p> {
-    p: &'a Product<'p>,
-    ends: Ends,
-    /// First row, in the whole product and in the block.
-    row: usize,
+/// Some rows of `P` panels.
+struct Tile<'a, 'p, const P: usize> {
+    block: &'a Block<'a, 'p>,
+    /// First row in the block.
     i: usize,
     panel: usize,
-    weights: &'a [f32],
-    pieces: &'a Pieces,
+    weights: [&'a [f32]; P],
 }
 
-impl Tile<'_, '_> {
-    /// `WHOLE` says that all 16 columns exist.
+impl<const P: usize> Tile<'_, '_, P> {
+    /// `WHOLE` says that all columns exist; else only the last panel lacks some.
     #[inline(always)]
-    fn run<S: Simd, T: Target, const N: usize, const WHOLE: bool>(
-        self,
-        s: S,
-        target: &T,
-        offsets: &[usize; ROWS],
-        out: &mut [f32],
-    ) {
-        let column = self.panel * LANES;
-        let width = if WHOLE { LANES } else { self.p.columns - column };
-        let offset = |r: usize| offsets[self.i + r] + column;
-        let mut sums = [s.splat(0.0); N];
+    fn run<S: Simd, T: Target, const N: usize, const WHOLE: bool>(self, s: S, target: &T, out: &mut [f32]) {
+        let Block { p, ends, row, offsets, pieces, .. } = *self.block;
+        let column = |j: usize| (self.panel + j) * LANES;
+        let width = |j: usize| if WHOLE { LANES } else { LANES.min(p.columns - column(j)) };
+        let offset = |r: usize, j: usize| offsets[self.i + r] + column(j);
+        let residual_row = |r: usize| target.residual_row(row + self.i + r);
+        let mut sums = [[s.splat(0.0); P]; N];
         for r in 0..N {
-            sums[r] = if self.ends.first {
-                let bias = s.load_part(&self.p.bias[column..column + LANES]);
-                match self.p.residual {
-                    Residual::InPlace => s.add(bias, load::<S, WHOLE>(s, &out[offset(r)..][..width])),
-                    Residual::Before { rows, stride } => {
-                        let at = target.residual_row(self.row + r) * stride + column;
-                        s.add(bias, load::<S, WHOLE>(s, &rows[at..][..width]))
+            for j in 0..P {
+                sums[r][j] = if ends.first {
+                    let bias = s.load_part(&p.bias[column(j)..column(j) + LANES]);
+                    match p.residual {
+                        Residual::InPlace => s.add(bias, load::<S, WHOLE>(s, &out[offset(r, j)..][..width(j)])),
+                        Residual::Before { rows, stride } => {
+                            let at = residual_row(r) * stride + column(j);
+                            s.add(bias, load::<S, WHOLE>(s, &rows[at..][..width(j)]))
+                        }
+                        _ => bias,
                     }
-                    _ => bias,
-                }
-            } else {
-                load::<S, WHOLE>(s, &out[offset(r)..][..width])
-            };
+                } else {
+                    load::<S, WHOLE>(s, &out[offset(r, j)..][..width(j)])
+                };
+            }
         }
-        let mut weights = self.weights;
-        for piece in 0..self.pieces.count {
-            let len = self.pieces.len[piece];
-            let a = std::array::from_fn(|r| self.pieces.start[piece][self.i + r]);
-            let (now, rest) = weights.split_at(len * LANES);
+        let mut k = 0;
+        for piece in 0..pieces.count {
+            let len = pieces.len[piece];
+            let a = std::array::from_fn(|r| pieces.start[piece][self.i + r]);
+            let weights = self.weights.map(|w| &w[k * LANES..(k + len) * LANES]);
             // SAFETY: `Pieces::find` set these pointers to pieces of `len` numbers each, in this k block, and nothing
             // has written there since.
-            sums = unsafe { multiply(s, a, now, sums) };
-            weights = rest;
+            sums = unsafe { multiply(s, a, weights, len, sums) };
+            k += len;
         }
         for r in 0..N {
-            let mut sum = sums[r];
-            if self.ends.last {
-                if self.p.relu {
-                    sum = s.relu(sum);
+            for j in 0..P {
+                let mut sum = sums[r][j];
+                if ends.last {
+                    if p.relu {
+                        sum = s.relu(sum);
+                    }
+                    if let Residual::After { rows, stride } = p.residual {
+                        let at = residual_row(r) * stride + column(j);
+                        sum = s.add(sum, load::<S, WHOLE>(s, &rows[at..][..width(j)]));
+                    }
                 }
-                if let Residual::After { rows, stride } = self.p.residual {
-                    let at = target.residual_row(self.row + r) * stride + column;
-                    sum = s.add(sum, load::<S, WHOLE>(s, &rows[at..][..width]));
+                let out = &mut out[offset(r, j)..][..width(j)];
+                if WHOLE {
+                    s.store(out.first_chunk_mut().expect("16 columns"), sum);
+                } else {
+                    s.store_part(out, sum);
                 }
-            }
-            let out = &mut out[offset(r)..][..width];
-            if WHOLE {
-                s.store(out.first_chunk_mut().expect("16 columns"), sum);
-            } else {
-                s.store_part(out, sum);
             }
         }
     }
@@ -396,25 +525,35 @@ fn load<S: Simd, const WHOLE: bool>(s: S, x: &[f32]) -> S::V {
     if WHOLE { s.load(x.first_chunk().expect("16 columns")) } else { s.load_part(x) }
 }
 
-/// `sums[r] += a[r][k] * weights[k]` for k ascending: the loop that the whole library spends its time in.
+/// `sums[r][j] += a[r][k] * weights[j][k]` for k ascending: the loop that the whole library spends its time in.
+///
+/// # Panics
+/// If the weights are not `depth` rows of 16.
 ///
 /// # Safety
-/// Each pointer must be valid for reading as many numbers as `weights` has rows of 16.
+/// Each pointer must be valid for reading `depth` numbers.
 #[inline(always)]
-unsafe fn multiply<S: Simd, const N: usize>(
+unsafe fn multiply<S: Simd, const N: usize, const P: usize>(
     s: S,
     a: [*const f32; N],
-    weights: &[f32],
-    mut sums: [S::V; N],
-) -> [S::V; N] {
-    let depth = weights.len() / LANES;
-    let weights = weights.as_ptr();
+    weights: [&[f32]; P],
+    depth: usize,
+    mut sums: [[S::V; P]; N],
+) -> [[S::V; P]; N] {
+    assert!(weights.iter().all(|w| w.len() == depth * LANES), "the weights are not as deep as the piece");
+    let weights = weights.map(|w| w.as_ptr());
     for k in 0..depth {
         // SAFETY: k < depth, within the weights and, as the caller promises, within every row's piece.
         unsafe {
-            let w = s.load_ptr(weights.add(k * LANES));
+            let mut w = [s.splat(0.0); P];
+            for j in 0..P {
+                w[j] = s.load_ptr(weights[j].add(k * LANES));
+            }
             for r in 0..N {
-                sums[r] = s.mul_add(s.splat(*a[r].add(k)), w, sums[r]);
+                let a = s.splat(*a[r].add(k));
+                for j in 0..P {
+                    sums[r][j] = s.mul_add(a, w[j], sums[r][j]);
+                }
             }
         }
     }

@@ -65,6 +65,7 @@ struct Run<'a> {
 impl Kernel for Run<'_> {
     type Output = ();
 
+    #[inline(always)]
     fn reference(self) {
         let a = self.args;
         for (i, x) in self.rows.iter_mut().enumerate() {
@@ -112,12 +113,15 @@ impl Kernel for Run<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{Fill, Rng, assert_close, assert_lively, assert_same_bits, pad_rows};
+    use crate::testing::{Fill, Rng, assert_close, assert_lively, assert_order_shows, assert_same_bits, pad_rows};
     use proptest::prelude::*;
 
     struct Case {
         channels: usize,
+        first_channel: usize,
+        stride: usize,
         relu: bool,
+        residual_after: bool,
         x: Vec<f32>,
         scale: Vec<f32>,
         shift: Vec<f32>,
@@ -131,19 +135,42 @@ mod tests {
             let scale = pad_rows(&fill(&mut rng, channels), channels, f32::NAN);
             let shift = pad_rows(&fill(&mut rng, channels), channels, f32::NAN);
             let residual = residual.then(|| fill(&mut rng, rows * channels));
-            Self { channels, relu, x, scale, shift, residual }
+            Self {
+                channels,
+                first_channel: 0,
+                stride: channels,
+                relu,
+                residual_after: false,
+                x,
+                scale,
+                shift,
+                residual,
+            }
+        }
+
+        /// The same channels amid others, with numbers of their own.
+        fn within(mut self, before: usize, after: usize, residual_after: bool, seed: u64, fill: Fill) -> Self {
+            let rows = self.x.len() / self.stride;
+            let mut rng = Rng::new(seed);
+            (self.first_channel, self.stride) = (before, before + self.channels + after);
+            self.x = fill(&mut rng, rows * self.stride);
+            self.residual = self.residual.map(|_| fill(&mut rng, rows * self.stride));
+            self.residual_after = residual_after;
+            self
         }
 
         fn args(&self) -> ScaleShift<'_> {
-            let Self { channels, relu, ref scale, ref shift, ref residual, .. } = *self;
+            let Self {
+                channels, first_channel, stride, relu, residual_after, ref scale, ref shift, ref residual, ..
+            } = *self;
             ScaleShift {
                 scale,
                 shift,
                 channels,
-                first_channel: 0,
-                stride: channels,
+                first_channel,
+                stride,
                 residual: residual.as_deref(),
-                residual_after: false,
+                residual_after,
                 relu,
             }
         }
@@ -170,6 +197,12 @@ mod tests {
             // The rectifier comes after the residual: -41 + 50 stays.
             case.residual = Some(vec![0.0, -20.0, 1.0, 50.0]);
             assert_eq!(case.all(isa), [2.5, 0.0, 7.5, 9.0]);
+            case.residual_after = true;
+            assert_eq!(case.all(isa), [2.5, -1.0, 7.5, 50.0]);
+            // Only the second of two channels: it takes the first factor and addend.
+            (case.channels, case.first_channel) = (1, 1);
+            assert_eq!(case.all(isa), [1.0, -15.5, 3.0, 50.0]);
+            (case.channels, case.first_channel, case.residual_after) = (2, 0, false);
         }
     }
 
@@ -180,11 +213,18 @@ mod tests {
         for [rows, channels] in SHAPES {
             for (residual, relu) in [(false, false), (false, true), (true, false), (true, true)] {
                 for fill in [Rng::wide as Fill, Rng::special] {
-                    let case = Case::new(rows, channels, residual, relu, 4, fill);
-                    let want = case.all(Isa::Scalar);
-                    assert_lively(&want, &format!("{rows} x {channels}"));
-                    for isa in Isa::available() {
-                        assert_same_bits(&case.all(isa), &want, &format!("{isa:?} {rows} x {channels}"));
+                    for [before, after] in [[0, 0], [3, 0], [16, 5]] {
+                        let case = Case::new(rows, channels, residual, relu, 4, fill);
+                        let case = case.within(before, after, before == 3, 5, fill);
+                        let want = case.all(Isa::Scalar);
+                        assert_lively(&want, &format!("{rows} x {channels}"));
+                        for isa in Isa::available() {
+                            assert_same_bits(
+                                &case.all(isa),
+                                &want,
+                                &format!("{isa:?} {rows} x {channels} after {before}"),
+                            );
+                        }
                     }
                 }
             }
@@ -194,22 +234,31 @@ mod tests {
     proptest! {
         #[test]
         fn any_shape_gives_the_scalar_bits(
-            rows in 0usize..12, channels in 1usize..70, residual: bool, relu: bool, seed: u64,
+            rows in 0usize..12, channels in 1usize..70, before in 0usize..20, residual: bool, after: bool, relu: bool,
+            seed: u64,
         ) {
-            let case = Case::new(rows, channels, residual, relu, seed, Rng::wide);
+            let case = Case::new(rows, channels, residual, relu, seed, Rng::fill_of(seed));
+            let case = case.within(before, before / 2, after, seed, Rng::fill_of(seed));
             let want = case.all(Isa::Scalar);
             for isa in Isa::available() {
                 assert_same_bits(&case.all(isa), &want, "whole");
                 let mut split = case.x.clone();
-                let at = rows / 2 * channels;
+                let at = rows / 2 * case.stride;
                 let (top, bottom) = split.split_at_mut(at);
-                for (part, range) in [(top, 0..at), (bottom, at..rows * channels)] {
+                for (part, range) in [(top, 0..at), (bottom, at..rows * case.stride)] {
                     let residual = case.residual.as_ref().map(|r| &r[range]);
                     scale_shift(isa, &ScaleShift { residual, ..case.args() }, part);
                 }
                 assert_same_bits(&split, &want, "split");
             }
         }
+    }
+
+    #[test]
+    fn the_fused_rounding_shows() {
+        let case = Case::new(9, 33, false, false, 7, Rng::ordinary);
+        let twice = case.x.iter().enumerate().map(|(i, x)| x * case.scale[i % 33] + case.shift[i % 33]);
+        assert_order_shows(&twice.collect::<Vec<_>>(), &case.all(Isa::Scalar), "rounded twice");
     }
 
     #[test]

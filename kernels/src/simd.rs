@@ -1,15 +1,17 @@
 //! Sixteen virtual lanes: the one vector type that kernel bodies are written over.
 //!
 //! A body is written once as `fn run<S: Simd>(self, s: S)` and instantiated per instruction set by [`dispatch`]. A vector
-//! always has [`LANES`] lanes, whatever the register width (AVX2 uses a pair of registers), so that packed weights,
-//! partial sums and tails look the same everywhere. The scalar instruction set has no vector: it runs the kernel's
-//! `reference`, which is the specification.
+//! always has [`LANES`] lanes, whatever the register width (AVX2 uses a pair of registers, AVX-512 one), so that packed
+//! weights, partial sums and tails look the same everywhere. The scalar instruction set has no vector: it runs the
+//! kernel's `reference`, which is the specification.
 
 use crate::isa::Isa;
 use half::f16;
 
 #[cfg(target_arch = "x86_64")]
 mod avx2;
+#[cfg(target_arch = "x86_64")]
+mod avx512;
 
 /// Lanes of a vector on every instruction set, and columns of a packed weight panel.
 pub const LANES: usize = 16;
@@ -21,6 +23,9 @@ pub const LANES: usize = 16;
 pub(crate) trait Simd: Copy {
     /// Sixteen f32 lanes.
     type V: Copy;
+    /// Whether there are 32 registers of 16 lanes, so that a tile can have 24 accumulators. Otherwise there are 16 of 8
+    /// lanes, which leave room for 6 accumulators.
+    const WIDE: bool;
 
     /// All lanes `x`.
     fn splat(self, x: f32) -> Self::V;
@@ -130,7 +135,8 @@ pub(crate) fn tree_sum(mut x: [f32; LANES]) -> f32 {
 pub(crate) trait Kernel: Sized {
     /// What the call returns.
     type Output;
-    /// The specification: plain loops in the order of the bit contract.
+    /// The specification: plain loops in the order of the bit contract. Must be `#[inline(always)]`, like everything in
+    /// it that multiplies and adds; see [`scalar`].
     fn reference(self) -> Self::Output;
     /// The same bits with vectors. Must be `#[inline(always)]`.
     fn run<S: Simd>(self, s: S) -> Self::Output;
@@ -140,13 +146,37 @@ pub(crate) trait Kernel: Sized {
 #[inline]
 pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
     match isa {
-        Isa::Scalar => kernel.reference(),
+        Isa::Scalar => scalar(
+            #[inline(always)]
+            || kernel.reference(),
+        ),
         #[cfg(target_arch = "x86_64")]
         Isa::Avx2(token) => {
             // SAFETY: the token proves that this CPU has AVX2, FMA and F16C.
             unsafe { avx2::run(token, kernel) }
         }
+        #[cfg(target_arch = "x86_64")]
+        Isa::Avx512(token) => {
+            // SAFETY: the token proves that this CPU has AVX-512 F, VL, DQ and BW besides AVX2, FMA and F16C.
+            unsafe { avx512::run(token, kernel) }
+        }
         #[cfg(not(target_arch = "x86_64"))]
-        Isa::Avx2(_) => unreachable!("the token is never made on this architecture"),
+        Isa::Avx2(_) | Isa::Avx512(_) => unreachable!("the token is never made on this architecture"),
     }
+}
+
+/// Calls `specification`, compiled so that `f32::mul_add` is the CPU's instruction if it has one. Compiled for any x86-64
+/// it is a call of the C library per multiply-add. Both round once, so the bits are the same; nothing else changes.
+#[inline]
+pub(crate) fn scalar<R>(specification: impl FnOnce() -> R) -> R {
+    #[cfg(target_arch = "x86_64")]
+    if std::arch::is_x86_feature_detected!("fma") {
+        #[target_feature(enable = "fma")]
+        fn with_fma<R>(specification: impl FnOnce() -> R) -> R {
+            specification()
+        }
+        // SAFETY: this CPU has FMA.
+        return unsafe { with_fma(specification) };
+    }
+    specification()
 }

@@ -43,18 +43,26 @@ impl Rng {
         (0..n).map(|_| one()).collect()
     }
 
-    /// Like [`Rng::wide`], but about one number in 80 is infinite or NaN.
+    /// Like [`Rng::wide`], but about one number in 80 is infinite or NaN, of either sign, quiet or signalling.
     pub(crate) fn special(&mut self, n: usize) -> Vec<f32> {
         let mut x = self.wide(n);
         for x in &mut x {
             match self.bits() % 240 {
                 0 => *x = f32::INFINITY,
                 1 => *x = f32::NEG_INFINITY,
-                2 => *x = f32::NAN,
+                2 => {
+                    let bits = self.bits() as u32;
+                    *x = f32::from_bits(bits & 0x807f_ffff | 0x7f80_0001);
+                }
                 _ => {}
             }
         }
         x
+    }
+
+    /// [`Rng::special`] for one seed in four, else [`Rng::wide`].
+    pub(crate) fn fill_of(seed: u64) -> Fill {
+        if seed.is_multiple_of(4) { Rng::special } else { Rng::wide }
     }
 }
 
@@ -77,6 +85,31 @@ pub(crate) fn assert_lively(values: &[f32], what: &str) {
     let finite = values.iter().filter(|v| v.is_finite()).count();
     assert!(2 * finite >= values.len(), "{what}: only {finite} of {} values are finite", values.len());
     assert!(values.iter().any(|v| v.is_finite() && *v != values[0]), "{what}: all values are {}", values[0]);
+}
+
+/// Asserts that two orders of the same sums differ in bits somewhere, and nowhere by much: inputs for which they agreed
+/// would hide a body that adds in another order.
+#[track_caller]
+pub(crate) fn assert_order_shows(one: &[f32], other: &[f32], what: &str) {
+    let wide: Vec<f64> = other.iter().map(|v| f64::from(*v)).collect();
+    assert_close(one, &wide, 1e-4, what);
+    let differ = one.iter().zip(other).filter(|(a, b)| a.to_bits() != b.to_bits()).count();
+    assert!(8 * differ >= one.len() && differ > 0, "{what}: only {differ} of {} depend on the order", one.len());
+}
+
+/// The rows of `columns` numbers in opposite order.
+pub(crate) fn reverse_rows(x: &[f32], columns: usize) -> Vec<f32> {
+    x.rchunks_exact(columns).flatten().copied().collect()
+}
+
+/// Each row's numbers in opposite order.
+pub(crate) fn reverse_columns(x: &[f32], columns: usize) -> Vec<f32> {
+    x.chunks_exact(columns).flat_map(|row| row.iter().rev()).copied().collect()
+}
+
+/// Packed weights of taps of `channels` channels each, with the channels in opposite order.
+pub(crate) fn reverse_channels(packed: &[f32], channels: usize) -> Vec<f32> {
+    packed.chunks_exact(channels * crate::LANES).flat_map(|tap| reverse_rows(tap, crate::LANES)).collect()
 }
 
 /// Asserts |got - want| <= tolerance * (1 + |want|).
@@ -116,6 +149,13 @@ impl Tally {
         self.telling.set(self.telling.get() + bits.len());
     }
 
+    /// As [`Tally::count`], if the case has finite numbers only: if [`Rng::fill_of`] its seed is [`Rng::wide`].
+    pub(crate) fn count_finite(&self, seed: u64, outputs: &[f32]) {
+        if !seed.is_multiple_of(4) {
+            self.count(outputs);
+        }
+    }
+
     /// Asserts that there were outputs, and that at least half of them were finite and distinct.
     #[track_caller]
     pub(crate) fn assert_half(&self) {
@@ -135,6 +175,23 @@ pub(crate) enum Joins {
 
 /// Every place where a residual can join.
 pub(crate) const JOINS: [Joins; 4] = [Joins::Nowhere, Joins::InPlace, Joins::Before, Joins::After];
+
+/// What happens besides the sum, and the precision of the weights.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Way {
+    pub(crate) half: bool,
+    pub(crate) joins: Joins,
+    pub(crate) relu: bool,
+}
+
+/// Nothing.
+pub(crate) const PLAIN: Way = Way { half: false, joins: Joins::Nowhere, relu: false };
+
+/// All sixteen.
+pub(crate) fn ways() -> Vec<Way> {
+    let of = |half, relu| JOINS.map(|joins| Way { half, joins, relu });
+    [of(false, false), of(true, true), of(true, false), of(false, true)].concat()
+}
 
 /// All of a [`Product`] but its left matrix, owned.
 pub(crate) struct Owned {
@@ -237,4 +294,43 @@ pub(crate) fn write_rows(rows: usize, stride: usize, before: &[f32], write: impl
         assert!(i % stride < columns || v.to_bits() == gap.to_bits(), "number {i}, between rows, was written");
     }
     out.chunks(stride.max(1)).flat_map(|row| &row[..columns]).copied().collect()
+}
+
+#[test]
+fn special_numbers_are_of_every_kind() {
+    for seed in 0..12 {
+        let x = Rng::new(seed).special(2000);
+        let kinds: [fn(&f32) -> bool; 9] = [
+            |v| v.is_nan() && v.is_sign_positive() && v.to_bits() & 0x0040_0000 != 0,
+            |v| v.is_nan() && v.is_sign_negative(),
+            |v| v.is_nan() && v.to_bits() & 0x0040_0000 == 0,
+            |v| *v == f32::INFINITY,
+            |v| *v == f32::NEG_INFINITY,
+            |v| v.to_bits() == 0.0f32.to_bits(),
+            |v| v.to_bits() == (-0.0f32).to_bits(),
+            |v| v.is_subnormal(),
+            |v| v.is_normal(),
+        ];
+        for (i, kind) in kinds.into_iter().enumerate() {
+            assert!(x.iter().any(kind), "seed {seed}: nothing of kind {i}");
+        }
+        assert!(Rng::new(seed).wide(2000).iter().all(|v| v.is_finite()));
+    }
+}
+
+/// The comparison that all kernels' tests rest on: it sees the last bit, the sign of zero, subnormals and NaN, in the first
+/// and the last place.
+#[test]
+fn one_changed_bit_is_noticed() {
+    let want: Vec<f32> = [vec![1.0; 16], vec![f32::NAN, 0.0, f32::MIN_POSITIVE / 2.0, f32::INFINITY, -2.0]].concat();
+    let noticed = |got: Vec<f32>| std::panic::catch_unwind(|| assert_same_bits(&got, &want, "")).is_err();
+    assert!(!noticed(want.clone()));
+    for place in 0..want.len() {
+        for bit in 0..32 {
+            let mut got = want.clone();
+            got[place] = f32::from_bits(got[place].to_bits() ^ 1 << bit);
+            assert_eq!(noticed(got.clone()), !(got[place].is_nan() && want[place].is_nan()), "{place} {bit}");
+        }
+    }
+    assert!(noticed(want[1..].to_vec()));
 }

@@ -22,7 +22,7 @@
 //!
 //! What the body changes, none of which can change a bit:
 //! 1. Keys (transposed) and values are packed into panels of 16 columns, so that the four products of a head are one
-//!    routine with tiles of 6 rows by 16 columns.
+//!    routine with tiles of 6 or 12 rows by 16 columns.
 //! 2. A head's output joins the next head's part in a copy of the window.
 //! 3. Queries lie amid zeros, so that no tap of their convolution needs a test.
 //! 4. The offsets are spread out to one row per token once per call; all windows of the call use them.
@@ -233,6 +233,7 @@ impl WindowAttention<'_> {
 impl Kernel for Run<'_> {
     type Output = ();
 
+    #[inline(always)]
     fn reference(self) {
         let (args, rows) = (self.args, self.args.shape.rows(self.window_row));
         let mut scratch = Scratch::new(&args.shape, self.scratch);

@@ -10,10 +10,18 @@ use std::ptr::NonNull;
 use voxcast_kernels::conv::{Conv, Geometry, conv};
 use voxcast_kernels::deconv3d::{Deconv3d, deconv3d};
 use voxcast_kernels::deform_conv2d::{DeformConv2d, deform_conv2d};
+use voxcast_kernels::depthwise::{Depthwise, depthwise};
+use voxcast_kernels::gate::{Gate, gate};
 use voxcast_kernels::gather::{Gather, gather};
 use voxcast_kernels::head::{Head, head, scratch_len};
+use voxcast_kernels::max_pool::{MaxPool, max_pool};
 use voxcast_kernels::panels::packed_len;
+use voxcast_kernels::pool::{Mean, mean};
 use voxcast_kernels::product::{Product, Residual, SCRATCH};
+use voxcast_kernels::project::{Projection, Sum, project_points};
+use voxcast_kernels::scale_shift::{ScaleShift, scale_shift};
+use voxcast_kernels::upsample_add::{UpsampleAdd, upsample_add};
+use voxcast_kernels::window_attention::{Shape, WindowAttention, window_attention};
 use voxcast_kernels::{Isa, Panels};
 
 /// Which end of a slice is watched.
@@ -280,6 +288,122 @@ fn head_of_whole_and_broken_blocks() {
             };
             head(isa, &args, 0..voxels, &mut chosen, Some(&mut logits), &mut scratch);
             chosen.iter().map(|class| f32::from(*class)).chain(logits.iter().copied()).collect()
+        });
+    }
+}
+
+#[test]
+fn depthwise_blocks_and_edges() {
+    for (width, channels, kernel) in [(17, 19usize, 3), (5, 16, 5), (9, 5, 1)] {
+        let padded = channels.next_multiple_of(16);
+        everywhere(|isa, side| {
+            let input = Guarded::new(side, &numbers(3 * width * channels));
+            let weights = Guarded::new(side, &numbers(kernel * kernel * padded));
+            let bias = Guarded::new(side, &numbers(padded));
+            let mut out = Guarded::filled(side, 3 * width * channels, 0.0);
+            let (input, weights, bias) = (&input[..], &weights[..], &bias[..]);
+            let args = Depthwise { input, height: 3, width, channels, kernel, weights, bias, residual: true };
+            depthwise(isa, &args, 0..3, &mut out);
+            out.to_vec()
+        });
+    }
+}
+
+#[test]
+fn whole_and_part_vectors_of_channels() {
+    for channels in [1usize, 15, 16, 17, 33] {
+        let padded = channels.next_multiple_of(16);
+        everywhere(|isa, side| {
+            let bev = Guarded::new(side, &numbers(3 * channels));
+            let mut weights = numbers(channels);
+            weights.resize(padded, 0.0);
+            let weights = Guarded::new(side, &weights);
+            let mut volume = Guarded::new(side, &numbers(3 * 7 * channels));
+            gate(isa, &Gate { bev: &bev, depth: 7, channels, weights: &weights, bias: 0.5 }, &mut volume);
+            volume.to_vec()
+        });
+        everywhere(|isa, side| {
+            let input = Guarded::new(side, &numbers(5 * 4 * channels));
+            let mut out = Guarded::filled(side, 3 * 2 * channels, 0.0);
+            let args = MaxPool { input: &input, height: 5, width: 4, channels, kernel: 3, stride: 2, padding: 1 };
+            max_pool(isa, &args, 0..3, &mut out);
+            out.to_vec()
+        });
+        everywhere(|isa, side| {
+            let input = Guarded::new(side, &numbers(5 * channels));
+            let mut out = Guarded::filled(side, channels, 0.0);
+            mean(isa, &Mean { input: &input, channels }, &mut out);
+            out.to_vec()
+        });
+        for first_channel in [0, 2] {
+            everywhere(|isa, side| {
+                let (scale, shift) = (Guarded::new(side, &numbers(padded)), Guarded::new(side, &numbers(padded)));
+                let residual = Guarded::new(side, &numbers(3 * (channels + 2)));
+                let mut rows = Guarded::new(side, &numbers(3 * (channels + 2)));
+                let args = ScaleShift {
+                    scale: &scale,
+                    shift: &shift,
+                    channels,
+                    first_channel,
+                    stride: channels + 2,
+                    residual: Some(&residual),
+                    residual_after: true,
+                    relu: true,
+                };
+                scale_shift(isa, &args, &mut rows);
+                rows.to_vec()
+            });
+        }
+        everywhere(|isa, side| {
+            let low = Guarded::new(side, &numbers(2 * 2 * channels));
+            let mut out = Guarded::new(side, &numbers(3 * 4 * channels));
+            let args = UpsampleAdd { low: &low, low_height: 2, low_width: 2, height: 3, width: 4, channels };
+            upsample_add(isa, &args, 0..3, &mut out);
+            out.to_vec()
+        });
+    }
+}
+
+#[test]
+fn attention() {
+    for (extent, heads, part) in [([7, 7], 2, 8), ([3, 4], 1, 17), ([8, 9], 3, 5)] {
+        let shape = Shape { extent, channels: heads * part, heads, key_dim: part };
+        let (pad, pad3) = (part.next_multiple_of(16), (3 * part).next_multiple_of(16));
+        for row in 0..shape.window_rows() {
+            everywhere(|isa, side| {
+                let lengths = [
+                    extent[0] * extent[1] * shape.channels,
+                    heads * packed_len(part, 3 * part),
+                    heads * pad3,
+                    heads * 25 * pad,
+                    heads * pad,
+                    heads * shape.side() * shape.side(),
+                    packed_len(shape.channels, shape.channels),
+                    shape.channels.next_multiple_of(16),
+                ];
+                let tensors = lengths.map(|n| Guarded::new(side, &numbers(n)));
+                let [input, qkv, qkv_bias, query, query_bias, offsets, proj, proj_bias] =
+                    tensors.each_ref().map(|t| &t[..]);
+                let args = WindowAttention { shape, input, qkv, qkv_bias, query, query_bias, offsets, proj, proj_bias };
+                let mut out = Guarded::filled(side, shape.rows(row).len() * extent[1] * shape.channels, 0.0);
+                let mut scratch = Guarded::filled(side, shape.scratch_len(), 0.0);
+                window_attention(isa, &args, row, &mut out, &mut scratch);
+                out.to_vec()
+            });
+        }
+    }
+}
+
+#[test]
+fn projected_points() {
+    for z in [1, 7, 8, 9, 24] {
+        everywhere(|isa, side| {
+            let [xs, ys, zs] = [3, 2, z].map(|n| Guarded::new(side, &numbers(n)));
+            let mut out = Guarded::filled(side, 6 * z, 7u32);
+            let matrix = [16., 0., 16., 0., 0., 16., 16., 0., 0., 0., 1., 2.];
+            let p = Projection { matrix, sum: Sum::Chain, width: 64, height: 32, stride_log2: 3, base: 1 };
+            project_points(isa, &p, &xs, &ys, &zs, &mut out);
+            out.to_vec()
         });
     }
 }

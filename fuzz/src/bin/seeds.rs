@@ -9,12 +9,22 @@ use pth::{Entry, Tensor, Wrap};
 use std::path::Path;
 use voxcast::graph::Rewrites;
 use voxcast::model::Options;
+use voxcast::random::Random;
 use voxcast::rig::RigBuilder;
 use voxcast::weights::Precision;
 
 fn main() -> std::io::Result<()> {
     let corpus = Path::new(env!("CARGO_MANIFEST_DIR")).join("corpus");
-    for (target, seeds) in [("checkpoint", checkpoints()), ("model", models()), ("rig", rigs())] {
+    let mut all = vec![
+        ("calibration", calibrations()),
+        ("checkpoint", checkpoints()),
+        ("image", images()),
+        ("model", models()),
+        ("rig", rigs()),
+        ("scene", scenes()),
+    ];
+    all.extend(KERNELS.map(|target| (target, drawn())));
+    for (target, seeds) in all {
         let dir = corpus.join(target);
         std::fs::create_dir_all(&dir)?;
         for (name, bytes) in &seeds {
@@ -23,6 +33,75 @@ fn main() -> std::io::Result<()> {
         println!("{}: {} seeds", dir.display(), seeds.len());
     }
     Ok(())
+}
+
+/// Targets whose inputs are shapes and numbers, which drawn bytes make as well as any others.
+const KERNELS: [&str; 14] = [
+    "conv",
+    "deconv3d",
+    "deform_conv2d",
+    "depthwise",
+    "gate",
+    "gather",
+    "head",
+    "max_pool",
+    "mean",
+    "normalise",
+    "project",
+    "scale_shift",
+    "upsample_add",
+    "window_attention",
+];
+
+fn drawn() -> Vec<(String, Vec<u8>)> {
+    let mut random = Random::new(1);
+    let lengths = [0, 4, 16, 16, 64, 64, 256, 1024];
+    let bytes = |(i, n): (usize, usize)| (i.to_string(), (0..n).map(|_| random.next_u64() as u8).collect());
+    lengths.into_iter().enumerate().map(bytes).collect()
+}
+
+fn calibrations() -> Vec<(String, Vec<u8>)> {
+    let matrix = "[[1,2,3,4],[5,6e-1,7,8],[9,10,11,12],[0,0,0,1.5]]";
+    let direct = format!(r#"{{"name":"a","file":"img/a.png","width":20,"height":10,"lidar2img":{matrix}}}"#);
+    let product = format!(
+        r#"{{"name":"b","file":"b.png","width":20,"height":10,
+            "intrinsic":[[100,0,10],[0,200,5],[0,0,1]],"lidar2camera":{matrix}}}"#
+    );
+    let both = format!("{direct},{product}");
+    let file = |cameras: &str| format!(r#"{{"source":null,"cameras":[{cameras}]}}"#).into_bytes();
+    vec![("direct".into(), file(&direct)), ("product".into(), file(&product)), ("both".into(), file(&both))]
+}
+
+/// Files of every decoder and several colour types, behind their size.
+fn images() -> Vec<(String, Vec<u8>)> {
+    use image::{DynamicImage, ImageFormat};
+    let mut random = Random::new(2);
+    let (width, height) = (9, 7);
+    let mut pixels = |n: u32| (0..width * height * n).map(|_| random.next_u64() as u8).collect::<Vec<_>>();
+    let rgb = image::RgbImage::from_raw(width, height, pixels(3)).expect("as many bytes as pixels ask for");
+    let rgb = DynamicImage::from(rgb);
+    let kinds = [
+        ("rgb.png", rgb.clone(), ImageFormat::Png),
+        ("rgba16.png", rgb.to_rgba16().into(), ImageFormat::Png),
+        ("grey.png", rgb.to_luma8().into(), ImageFormat::Png),
+        ("rgb.jpg", rgb.clone(), ImageFormat::Jpeg),
+        ("grey.jpg", rgb.to_luma8().into(), ImageFormat::Jpeg),
+    ];
+    kinds
+        .map(|(name, image, format)| {
+            let mut bytes = std::io::Cursor::new(vec![width as u8, height as u8]);
+            bytes.set_position(2);
+            image.write_to(&mut bytes, format).expect("memory to write to");
+            (name.to_owned(), bytes.into_inner())
+        })
+        .into()
+}
+
+/// A whole scene, and a header that asks for its data.
+fn scenes() -> Vec<(String, Vec<u8>)> {
+    let header = r#"{"images":{"dtype":"U8","shape":[2,3,4,3],"data_offsets":[0,72]},"lidar2img":{"dtype":"F32","shape":[2,4,4],"data_offsets":[72,200]}}"#;
+    let whole = [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), &[0x3f; 200]].concat();
+    vec![("whole".into(), whole), ("header".into(), header.into())]
 }
 
 /// The headers of sound models, behind a byte that chooses the weights.

@@ -8,6 +8,8 @@ use std::ops::Range;
 
 /// Rows of a tile: 12 accumulators of 8 lanes, the most that AVX2 holds beside weights and a broadcast.
 const TILE: usize = 6;
+/// The same with 32 registers: as many accumulators, of 16 lanes.
+const WIDE_TILE: usize = 12;
 /// Zeros before and after each axis of the queries.
 pub(super) const HALF: usize = QUERY_KERNEL / 2;
 
@@ -250,13 +252,17 @@ fn product<S: Simd>(s: S, a: Rows<'_>, weights: &[f32], bias: Option<&[f32]>, ou
         while r < rows {
             let a = Rows { values: &a.values[r * a.stride..], ..a };
             let out = &mut out[r * columns + i * LANES..];
-            if r + TILE <= rows {
-                tile::<S, TILE>(s, a, panel, start, out, columns);
-                r += TILE;
-            } else {
-                tile::<S, 1>(s, a, panel, start, out, columns);
-                r += 1;
+            macro_rules! tile {
+                ($n:expr) => {{
+                    tile::<S, { $n }>(s, a, panel, start, out, columns);
+                    $n
+                }};
             }
+            r += match rows - r {
+                WIDE_TILE.. if S::WIDE => tile!(WIDE_TILE),
+                TILE.. => tile!(TILE),
+                _ => tile!(1),
+            };
         }
     }
 }

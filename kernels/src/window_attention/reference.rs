@@ -8,6 +8,7 @@ use std::ops::Range;
 
 impl WindowAttention<'_> {
     /// The token's position in the plane as (row within the call's rows, column), or `None` if it is padding.
+    #[inline(always)]
     fn position(&self, rows: &Range<usize>, window: usize, token: usize) -> Option<[usize; 2]> {
         let [_, width] = self.shape.window();
         let at = [token / width, window * width + token % width];
@@ -15,6 +16,7 @@ impl WindowAttention<'_> {
     }
 
     /// The offset between two tokens in head `head`.
+    #[inline(always)]
     fn offset(&self, head: usize, t: usize, u: usize) -> f32 {
         let (side, [_, width]) = (self.shape.side(), self.shape.window());
         let (dx, dy) = ((t / width).abs_diff(u / width), (t % width).abs_diff(u % width));
@@ -22,6 +24,7 @@ impl WindowAttention<'_> {
     }
 
     /// One head of one window.
+    #[inline(always)]
     pub(super) fn reference_head(&self, rows: &Range<usize>, window: usize, head: usize, scratch: &mut Scratch<'_>) {
         let Shape { extent, channels, heads, key_dim, .. } = self.shape;
         let (part, tokens, [height, width]) = (self.shape.part(), self.shape.tokens(), self.shape.window());
@@ -76,6 +79,7 @@ impl WindowAttention<'_> {
     }
 
     /// The last product and the residual, for the tokens that are not padding.
+    #[inline(always)]
     pub(super) fn reference_projection(
         &self,
         rows: &Range<usize>,
@@ -99,6 +103,7 @@ impl WindowAttention<'_> {
     }
 }
 
+#[inline(always)]
 fn softmax(scores: &mut [f32]) {
     let mut max = [f32::NEG_INFINITY; LANES];
     for (u, &score) in scores.iter().enumerate() {
