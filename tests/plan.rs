@@ -49,7 +49,7 @@ fn memory_is_what_was_told() {
             let session = Session::new(model.clone(), rig.clone(), &options).unwrap();
             assert_eq!(session.taken(), told, "{options:?}");
             assert_eq!(told.arena, session.plan().bytes());
-            assert_eq!(told.total(), told.arena + told.output);
+            assert_eq!(told.total(), told.arena + told.images + told.output + told.tables);
         }
     }
     let more = Session::memory(&model, 7, &SessionOptions::default()).unwrap();
