@@ -8,6 +8,7 @@ mod inspect;
 mod profile;
 mod rig;
 mod run;
+mod synth;
 mod terminal;
 
 use clap::{Args, Parser, Subcommand};
@@ -48,6 +49,8 @@ enum Command {
     Inspect(inspect::Inspect),
     /// Time every operation of a model
     Profile(profile::Profile),
+    /// Draw synthetic street scenes with labels
+    Synth(synth::Synth),
 }
 
 impl Arguments {
@@ -59,6 +62,7 @@ impl Arguments {
             Command::Run(command) => command.run(),
             Command::Inspect(command) => command.run(),
             Command::Profile(command) => command.run(),
+            Command::Synth(command) => command.run(),
         }
     }
 }
@@ -72,12 +76,15 @@ pub struct ThreadCount {
 }
 
 impl ThreadCount {
-    pub fn threads(&self) -> Result<Threads> {
-        let count = match self.threads {
+    pub fn count(&self) -> usize {
+        match self.threads {
             Some(count) => usize::from(count),
             None => std::thread::available_parallelism().map_or(1, usize::from),
-        };
-        Threads::new(count)
+        }
+    }
+
+    pub fn threads(&self) -> Result<Threads> {
+        Threads::new(self.count())
     }
 }
 

@@ -125,6 +125,7 @@ pub mod rig;
 pub mod scene;
 pub mod seeded;
 pub mod session;
+pub mod synth;
 pub mod threads;
 pub mod weights;
 

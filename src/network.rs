@@ -87,7 +87,7 @@ fn default_cameras() -> usize {
 }
 
 /// Names that [`Network::built_in`] knows.
-pub const BUILT_IN: [&str; 3] = ["nuscenes-200", "nuscenes-256", "semantickitti-256"];
+pub const BUILT_IN: [&str; 4] = ["nuscenes-200", "nuscenes-256", "semantickitti-256", "edge"];
 
 /// No dimension of a network may exceed this: with [`MAX_VOXELS`] it keeps every size that is computed from them within
 /// 64 bits.
@@ -137,6 +137,20 @@ impl Network {
                 image: [384, 1248],
                 cameras: 1,
                 ..nuscenes_256
+            }),
+            "edge" => Some(Network {
+                depths: [2, 2, 2, 2],
+                width: 24,
+                dcn: [false; 4],
+                block: Block::Basic,
+                fpn: 64,
+                channels: [16, 32, 48, 64],
+                key_dims: [4, 6, 8],
+                // The ground, 1.84 m below the lidar, passes through the middle of its voxels.
+                bounds: [[-50.0, 50.0], [-50.0, 50.0], [-5.3, 2.7]],
+                image: [128, 352],
+                grids: [[52, 52, 4], [26, 26, 2], [13, 13, 1]],
+                ..nuscenes_200
             }),
             _ => None,
         }

@@ -1,0 +1,220 @@
+//! What fills the voxels of a grid, and which of them the cameras see.
+
+use super::camera::Pinhole;
+use super::objects::class;
+use super::render::View;
+use super::solid::Object;
+use super::world::World;
+use crate::network::Network;
+use glam::{Vec2, Vec3};
+
+/// Points per axis that are asked in every voxel.
+const POINTS: usize = 4;
+
+/// Points of a voxel that vehicles, buildings and plants must fill: a sixth of it.
+const SOLID: u16 = 11;
+
+/// Points that people, cones and other small things must fill: one upright of them.
+const SMALL: u16 = 4;
+
+/// Classes of which a voxel is rarely full.
+const SMALL_CLASSES: [u8; 5] =
+    [class::BARRIER, class::BICYCLE, class::MOTORCYCLE, class::PEDESTRIAN, class::TRAFFIC_CONE];
+
+/// The output grid of a network, in vehicle coordinates.
+pub(super) struct Grid {
+    size: [usize; 3],
+    low: Vec3,
+    edge: Vec3,
+    /// The vehicle's direction in the lidar frame.
+    forward: Vec2,
+}
+
+impl Grid {
+    pub(super) fn new(network: &Network, forward: [f32; 2]) -> Self {
+        let low = Vec3::from_array(std::array::from_fn(|a| network.bounds[a][0]));
+        let edge = Vec3::from_array(network.voxel_size());
+        Self { size: network.output_grid(), low, edge, forward: Vec2::from_array(forward) }
+    }
+
+    fn voxels(&self) -> usize {
+        self.size.iter().product()
+    }
+
+    /// From the lidar frame to vehicle coordinates.
+    fn vehicle(&self, v: Vec3) -> Vec3 {
+        let Vec2 { x, y } = self.forward;
+        Vec3::new(v.x * x + v.y * y, v.y * x - v.x * y, v.z)
+    }
+
+    /// From vehicle coordinates to the lidar frame.
+    fn lidar(&self, v: Vec3) -> Vec3 {
+        let Vec2 { x, y } = self.forward;
+        Vec3::new(v.x * x - v.y * y, v.x * y + v.y * x, v.z)
+    }
+}
+
+/// Points of one voxel that things of a class fill.
+struct Fill {
+    voxel: u32,
+    class: u8,
+    points: u16,
+}
+
+/// Class of every voxel, `[x, y, z]`: of what fills enough of it, else of the ground that passes through it, else 0.
+///
+/// In each voxel `POINTS`^3 points are asked. Solids are filled. Thin things are taken to be as thick as the points are
+/// apart, so that none slips through.
+pub(super) fn voxels(world: &World, grid: &Grid) -> Vec<u8> {
+    let mut classes = vec![0u8; grid.voxels()];
+    ground(world, grid, &mut classes);
+    let mut fills = Vec::new();
+    for object in &world.objects {
+        fill(world, grid, object, &mut fills);
+    }
+    // Of several classes in a voxel the one with most points wins, of equal ones the lower.
+    fills.sort_unstable_by_key(|f| (f.voxel, f.class));
+    let mut best = (0, 0u16);
+    for same in fills.chunk_by(|a, b| (a.voxel, a.class) == (b.voxel, b.class)) {
+        let (voxel, class) = (same[0].voxel, same[0].class);
+        let points = same.iter().map(|f| f.points).sum();
+        let enough = if SMALL_CLASSES.contains(&class) { SMALL } else { SOLID };
+        if best.0 != voxel {
+            best = (voxel, 0);
+        }
+        if points >= enough && points > best.1 {
+            best.1 = points;
+            classes[voxel as usize] = class;
+        }
+    }
+    classes
+}
+
+/// The surface of the ground: in every column of points the voxel that it passes through, by majority.
+fn ground(world: &World, grid: &Grid, classes: &mut [u8]) {
+    let [nx, ny, nz] = grid.size;
+    let step = grid.edge / POINTS as f32;
+    for x in 0..nx {
+        for y in 0..ny {
+            let mut votes = [(0usize, 0u8); POINTS * POINTS];
+            for (n, vote) in votes.iter_mut().enumerate() {
+                let at = Vec3::new((x * POINTS + n / POINTS) as f32 + 0.5, (y * POINTS + n % POINTS) as f32 + 0.5, 0.0);
+                let lidar = grid.low.with_z(0.0) + at * step;
+                let at = world.placed(grid.vehicle(lidar));
+                let height = world.street.height(at.truncate()) - at.z;
+                let z = ((height - grid.low.z) / grid.edge.z).floor();
+                *vote = if z >= 0.0 && z < nz as f32 { (z as usize, world.ground(at.truncate())) } else { (nz, 0) };
+            }
+            votes.sort_unstable();
+            let mut most = [0usize; 1];
+            let mut last = nz;
+            for same in votes.chunk_by(|a, b| a == b) {
+                let (z, class) = same[0];
+                if z != last {
+                    (most, last) = ([0], z);
+                }
+                if z < nz && same.len() > most[0] {
+                    most[0] = same.len();
+                    classes[(x * ny + y) * nz + z] = class;
+                }
+            }
+        }
+    }
+}
+
+/// Appends the points that an object fills.
+fn fill(world: &World, grid: &Grid, object: &Object, fills: &mut Vec<Fill>) {
+    let step = grid.edge / POINTS as f32;
+    let thick = step.max_element();
+    let [nx, ny, nz] = grid.size;
+    let points = [nx * POINTS, ny * POINTS, nz * POINTS];
+    // The object's box, turned into the grid.
+    let [low, high] = object.bounds();
+    let origin = world.placed(Vec3::ZERO);
+    let Vec2 { x: c, y: s } = world.ego.1;
+    let corner = |n: usize| {
+        let at = Vec3::new([low.x, high.x][n & 1], [low.y, high.y][n >> 1 & 1], low.z) - origin;
+        grid.lidar(Vec3::new(c * at.x + s * at.y, c * at.y - s * at.x, at.z))
+    };
+    let corners = [0, 1, 2, 3].map(corner);
+    let near = corners.iter().fold(Vec3::INFINITY, |m, &v| m.min(v)) - Vec3::splat(thick);
+    let far = corners.iter().fold(Vec3::NEG_INFINITY, |m, &v| m.max(v))
+        + Vec3::new(0.0, 0.0, high.z - low.z)
+        + Vec3::splat(thick);
+    let range = |axis: usize| {
+        let at = |v: f32| ((v - grid.low[axis]) / step[axis]).clamp(0.0, points[axis] as f32) as usize;
+        at(near[axis])..at(far[axis])
+    };
+    for x in range(0) {
+        for y in range(1) {
+            let at = |z: usize| grid.low + (Vec3::new(x as f32, y as f32, z as f32) + 0.5) * step;
+            // Along a column only the height changes.
+            let base = object.inwards(world.placed(grid.vehicle(at(0))) - object.at);
+            let (mut last, mut count) = (nz, 0);
+            let mut close = |z: usize, count: u16| {
+                if count > 0 {
+                    let voxel = ((x / POINTS * ny + y / POINTS) * nz + z) as u32;
+                    fills.push(Fill { voxel, class: object.class, points: count });
+                }
+            };
+            for z in range(2) {
+                if z / POINTS != last {
+                    close(last, count);
+                    (last, count) = (z / POINTS, 0);
+                }
+                let point = base + Vec3::Z * (z as f32 * step.z);
+                count += u16::from(object.parts.iter().any(|p| p.contains(point, thick)));
+            }
+            close(last, count);
+        }
+    }
+}
+
+/// Per voxel whether a camera sees it: whether the ray of one of its pixels goes through it or ends on it.
+pub(super) fn visible(grid: &Grid, cameras: &[Pinhole], views: &[View]) -> Vec<u8> {
+    let mut seen = vec![0u8; grid.voxels()];
+    for (camera, view) in cameras.iter().zip(views) {
+        let [height, width] = camera.size;
+        // Large images need not be asked pixel by pixel.
+        let stride = (width / 352).max(1);
+        for v in (0..height).step_by(stride) {
+            for u in (0..width).step_by(stride) {
+                let ray = grid.lidar(camera.ray(u as f64, v as f64).as_vec3());
+                // A little farther than the surface, which may lie on the border of two voxels.
+                let depth = view.depths[v * width + u] + 0.02;
+                walk(grid, grid.lidar(camera.at.as_vec3()), ray, depth, &mut seen);
+            }
+        }
+    }
+    seen
+}
+
+/// Marks the voxels that a ray passes through up to `limit` times its length.
+fn walk(grid: &Grid, origin: Vec3, ray: Vec3, limit: f32, seen: &mut [u8]) {
+    let size = Vec3::from_array(grid.size.map(|n| n as f32));
+    let (origin, ray) = ((origin - grid.low) / grid.edge, ray / grid.edge);
+    let inverse = ray.recip();
+    let Some((near, far)) = super::solid::slab(Vec3::ZERO, size, origin, inverse) else { return };
+    let far = far.min(limit);
+    if near > far {
+        return;
+    }
+    let mut voxel = (origin + ray * near).floor().clamp(Vec3::ZERO, size - 1.0);
+    let step = Vec3::from_array(ray.to_array().map(|v| if v < 0.0 { -1.0 } else { 1.0 }));
+    let ahead = step.max(Vec3::ZERO);
+    loop {
+        let [x, y, z] = voxel.to_array().map(|v| v as usize);
+        seen[(x * grid.size[1] + y) * grid.size[2] + z] = 1;
+        let exits = (voxel + ahead - origin) * inverse;
+        // A ray along an axis never leaves across it.
+        let exits = exits.to_array().map(|v| if v.is_nan() { f32::INFINITY } else { v });
+        let axis = if exits[0] <= exits[1] && exits[0] <= exits[2] { 0 } else { 1 + usize::from(exits[2] < exits[1]) };
+        if exits[axis] >= far {
+            return;
+        }
+        voxel[axis] += step[axis];
+        if voxel[axis] < 0.0 || voxel[axis] >= size[axis] {
+            return;
+        }
+    }
+}

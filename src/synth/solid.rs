@@ -1,0 +1,167 @@
+//! Solids that objects are made of: where a ray meets them, and which points lie in them.
+
+use super::texture::Finish;
+use glam::{Vec2, Vec3};
+
+/// The shape of a part, filling the box from `centre - half` to `centre + half`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Shape {
+    Box,
+    Ellipsoid,
+    /// A cylinder along the axis 0, 1 or 2; elliptic if the other two half lengths differ.
+    Cylinder(usize),
+}
+
+/// One solid, in the coordinates of its object.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Part {
+    pub(super) shape: Shape,
+    pub(super) centre: Vec3,
+    pub(super) half: Vec3,
+    pub(super) colour: Vec3,
+    pub(super) finish: Finish,
+}
+
+/// Parts that stand together, turned about the vertical and put somewhere.
+#[derive(Clone, Debug)]
+pub(super) struct Object {
+    /// Class of the voxels that it fills.
+    pub(super) class: u8,
+    /// The origin of its coordinates in the world.
+    pub(super) at: Vec3,
+    /// Its x axis in the world: a unit vector.
+    pub(super) along: Vec2,
+    pub(super) parts: Vec<Part>,
+    low: Vec3,
+    high: Vec3,
+}
+
+/// Where a ray meets a part.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Hit {
+    pub(super) distance: f32,
+    /// Outwards, a unit vector.
+    pub(super) normal: Vec3,
+}
+
+impl Object {
+    /// With the parts' common bounds.
+    pub(super) fn new(class: u8, at: Vec3, along: Vec2, parts: Vec<Part>) -> Self {
+        let low = parts.iter().fold(Vec3::INFINITY, |low, p| low.min(p.centre - p.half));
+        let high = parts.iter().fold(Vec3::NEG_INFINITY, |high, p| high.max(p.centre + p.half));
+        Self { class, at, along, parts, low, high }
+    }
+
+    /// A direction of the world in the object's coordinates.
+    pub(super) fn inwards(&self, v: Vec3) -> Vec3 {
+        let Vec2 { x: c, y: s } = self.along;
+        Vec3::new(c * v.x + s * v.y, c * v.y - s * v.x, v.z)
+    }
+
+    /// A direction of the object in the world's coordinates.
+    pub(super) fn outwards(&self, v: Vec3) -> Vec3 {
+        let Vec2 { x: c, y: s } = self.along;
+        Vec3::new(c * v.x - s * v.y, s * v.x + c * v.y, v.z)
+    }
+
+    /// Corners of the box, parallel to the world's axes, that holds it.
+    pub(super) fn bounds(&self) -> [Vec3; 2] {
+        let (middle, half) = ((self.low + self.high) * 0.5, (self.high - self.low) * 0.5);
+        let (middle, along) = (self.at + self.outwards(middle), self.along.abs());
+        let reach = Vec3::new(along.x * half.x + along.y * half.y, along.y * half.x + along.x * half.y, half.z);
+        [middle - reach, middle + reach]
+    }
+
+    /// The nearest part that a ray of the world meets before `limit`, and where.
+    pub(super) fn hit(&self, origin: Vec3, ray: Vec3, limit: f32) -> Option<(usize, Hit)> {
+        let (origin, ray) = (self.inwards(origin - self.at), self.inwards(ray));
+        let inverse = ray.recip();
+        slab(self.low, self.high, origin, inverse).filter(|&(near, _)| near < limit)?;
+        let mut best: Option<(usize, Hit)> = None;
+        for (index, part) in self.parts.iter().enumerate() {
+            let limit = best.map_or(limit, |(_, hit)| hit.distance);
+            if let Some(hit) = part.hit(origin, ray, inverse).filter(|hit| hit.distance < limit) {
+                best = Some((index, hit));
+            }
+        }
+        best.map(|(index, hit)| (index, Hit { normal: self.outwards(hit.normal), ..hit }))
+    }
+
+    /// Whether any part lies in the ray's way before `limit`.
+    pub(super) fn shades(&self, origin: Vec3, ray: Vec3, limit: f32) -> bool {
+        let (origin, ray) = (self.inwards(origin - self.at), self.inwards(ray));
+        let inverse = ray.recip();
+        slab(self.low, self.high, origin, inverse).is_some_and(|(near, _)| near < limit)
+            && self.parts.iter().any(|p| p.hit(origin, ray, inverse).is_some_and(|hit| hit.distance < limit))
+    }
+}
+
+impl Part {
+    fn hit(&self, origin: Vec3, ray: Vec3, inverse: Vec3) -> Option<Hit> {
+        let origin = origin - self.centre;
+        let (near, far) = slab(-self.half, self.half, origin, inverse)?;
+        match self.shape {
+            Shape::Box => {
+                if near <= 0.0 {
+                    return None;
+                }
+                let size = ((origin + ray * near) / self.half).abs();
+                let axis = if size.x >= size.y && size.x >= size.z { 0 } else { 1 + usize::from(size.z > size.y) };
+                let mut normal = Vec3::ZERO;
+                normal[axis] = if ray[axis] > 0.0 { -1.0 } else { 1.0 };
+                Some(Hit { distance: near, normal })
+            }
+            Shape::Ellipsoid => {
+                let (distance, at) = round(origin / self.half, ray / self.half)?;
+                (distance > 0.0).then(|| Hit { distance, normal: (at / self.half).normalize_or(Vec3::Z) })
+            }
+            Shape::Cylinder(axis) => self.hit_cylinder(axis, origin, ray, [near, far]),
+        }
+    }
+
+    fn hit_cylinder(&self, axis: usize, origin: Vec3, ray: Vec3, [near, far]: [f32; 2]) -> Option<Hit> {
+        let (mut from, mut along) = (origin / self.half, ray / self.half);
+        let (start, step) = (from[axis], along[axis]);
+        (from[axis], along[axis]) = (0.0, 0.0);
+        let mantle = round(from, along).filter(|&(distance, _)| distance > 0.0);
+        if let Some((distance, at)) = mantle.filter(|(d, _)| (start + step * d).abs() <= 1.0) {
+            return Some(Hit { distance, normal: (at / self.half).normalize_or(Vec3::Z) });
+        }
+        // Through one of the ends, where the slab was entered, if that lies in the circle.
+        let at = from + along * near;
+        let on_end = (start + step * near).abs() > 0.999;
+        (near > 0.0 && near <= far && on_end && at.length_squared() <= 1.0).then(|| {
+            let mut normal = Vec3::ZERO;
+            normal[axis] = if step > 0.0 { -1.0 } else { 1.0 };
+            Hit { distance: near, normal }
+        })
+    }
+
+    /// Whether a point in the object's coordinates lies inside, the part being at least `thick` thick to every side.
+    pub(super) fn contains(&self, at: Vec3, thick: f32) -> bool {
+        let at = (at - self.centre) / self.half.max(Vec3::splat(thick * 0.5));
+        match self.shape {
+            Shape::Box => at.abs().max_element() <= 1.0,
+            Shape::Ellipsoid => at.length_squared() <= 1.0,
+            Shape::Cylinder(axis) => at[axis].abs() <= 1.0 && at.length_squared() - at[axis] * at[axis] <= 1.0,
+        }
+    }
+}
+
+/// First meeting with the unit sphere of a ray whose direction need not be a unit vector, and the point.
+fn round(from: Vec3, along: Vec3) -> Option<(f32, Vec3)> {
+    let (a, b, c) = (along.dot(along), from.dot(along), from.dot(from) - 1.0);
+    let root = b * b - a * c;
+    if root <= 0.0 || a <= 0.0 {
+        return None;
+    }
+    let distance = (-b - root.sqrt()) / a;
+    Some((distance, from + along * distance))
+}
+
+/// Distances at which a ray enters, 0 for a start inside, and leaves a box.
+pub(super) fn slab(low: Vec3, high: Vec3, origin: Vec3, inverse: Vec3) -> Option<(f32, f32)> {
+    let (a, b) = ((low - origin) * inverse, (high - origin) * inverse);
+    let (near, far) = (a.min(b).max_element().max(0.0), a.max(b).min_element());
+    (near <= far).then_some((near, far))
+}
