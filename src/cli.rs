@@ -8,6 +8,7 @@ mod inspect;
 mod profile;
 mod rig;
 mod run;
+mod selftest;
 mod synth;
 mod terminal;
 
@@ -49,6 +50,8 @@ enum Command {
     Inspect(inspect::Inspect),
     /// Time every operation of a model
     Profile(profile::Profile),
+    /// Check that this machine computes what a model must give
+    Selftest(selftest::SelfTest),
     /// Draw synthetic street scenes with labels
     Synth(synth::Synth),
 }
@@ -62,6 +65,7 @@ impl Arguments {
             Command::Run(command) => command.run(),
             Command::Inspect(command) => command.run(),
             Command::Profile(command) => command.run(),
+            Command::Selftest(command) => command.run(),
             Command::Synth(command) => command.run(),
         }
     }

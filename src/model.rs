@@ -7,6 +7,7 @@ use crate::container::{Container, Data, Layout, Tensor};
 use crate::error::{Error, ErrorKind, Result};
 use crate::graph::{Graph, Operation, Rewrites};
 use crate::network::Network;
+use crate::selftest::{self, SelfTest};
 use crate::weights::{Part, Precision, parts};
 use half::f16;
 use safetensors::Dtype;
@@ -144,6 +145,35 @@ impl Model {
     /// The file's checksum.
     pub fn checksum(&self) -> Option<u64> {
         self.container.checksum()
+    }
+
+    /// The self-test that the model carries, if any.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Format`] if it is malformed.
+    pub fn self_test(&self) -> Result<Option<SelfTest>> {
+        let Some(text) = self.container.metadata().get(selftest::KEY) else { return Ok(None) };
+        let malformed = |e: serde_json::Error| {
+            let error = Error::format(format!("metadata key \"{}\": {e}", selftest::KEY));
+            match &self.path {
+                Some(path) => error.in_file(path),
+                None => error,
+            }
+        };
+        serde_json::from_str(text).map(Some).map_err(malformed)
+    }
+
+    /// What the file says of itself.
+    pub(crate) fn metadata(&self) -> &BTreeMap<String, String> {
+        self.container.metadata()
+    }
+
+    /// Name, element type, dimensions and bytes of the stored tensors, in file order.
+    pub(crate) fn contents(&self) -> impl Iterator<Item = (String, Dtype, &[usize], &[u8])> + '_ {
+        self.container.names().into_iter().filter_map(|name| {
+            let (dtype, shape, bytes) = self.container.tensor(&name)?;
+            Some((name, dtype, shape, bytes))
+        })
     }
 
     /// Names, element types and lengths of the stored tensors, in file order.

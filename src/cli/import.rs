@@ -1,6 +1,6 @@
 //! `voxcast import`
 
-use super::terminal;
+use super::{ThreadCount, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
 use voxcast::checkpoint::Checkpoint;
@@ -8,7 +8,7 @@ use voxcast::graph::Rewrites;
 use voxcast::model::{Model, Options};
 use voxcast::network::BUILT_IN;
 use voxcast::weights::Precision;
-use voxcast::{Error, ErrorKind, Network, Result};
+use voxcast::{Error, ErrorKind, Isa, Network, Result};
 
 /// Turn a training checkpoint into a model: batch norms and the projection folded in f64, weights packed as the kernels
 /// read them.
@@ -35,6 +35,11 @@ pub struct Import {
     /// The model to write
     #[arg(short, long, value_name = "MODEL")]
     output: PathBuf,
+    /// Leave out the self-test, for which two cameras are computed once
+    #[arg(long)]
+    no_self_test: bool,
+    #[command(flatten)]
+    threads: ThreadCount,
 }
 
 impl Import {
@@ -54,6 +59,10 @@ impl Import {
             bar.set_position(done as u64);
         })
         .map_err(|e| e.in_file(&self.checkpoint))?;
+        if !self.no_self_test {
+            bar.set_message("self-test");
+            voxcast::selftest::record(&self.output, Isa::best(), &self.threads.threads()?)?;
+        }
         bar.finish_and_clear();
         let model = Model::open(&self.output)?;
         println!(

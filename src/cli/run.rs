@@ -177,11 +177,13 @@ impl Summary {
         let mut counts = vec![0usize; network.classes];
         result.classes.iter().for_each(|&class| counts[usize::from(class)] += 1);
         let digest = digest(result);
+        let logits = result.logits_digest().map(|d| format!("{d:016x}"));
         if json {
             let value = serde_json::json!({
                 "grid": result.grid,
                 "counts": counts,
                 "digest": digest,
+                "logits_digest": logits,
                 "seconds": {
                     "load": self.loaded.as_secs_f64(),
                     "rig": self.rig_time.as_secs_f64(),
@@ -197,6 +199,9 @@ impl Summary {
             "{x}x{y}x{z} voxels, {occupied} occupied ({:.1} %), digest {digest}",
             100.0 * occupied as f64 / result.classes.len() as f64
         );
+        if let Some(logits) = logits {
+            println!("logits digest {logits}");
+        }
         println!(
             "load {}, {} rig {}, frame {}",
             terminal::time(self.loaded),
@@ -209,5 +214,5 @@ impl Summary {
 
 /// XXH3-64 of the classes, by which two results are compared at a glance.
 pub fn digest(result: &Occupancy<'_>) -> String {
-    format!("{:016x}", xxhash_rust::xxh3::xxh3_64(result.classes))
+    format!("{:016x}", result.digest())
 }

@@ -1,6 +1,7 @@
 //! Results: what a frame writes and what a caller reads.
 
 use super::CameraStatus;
+use crate::digest;
 use crate::rig::Csr;
 use voxcast_kernels::gather::Mask;
 
@@ -22,6 +23,16 @@ pub struct Occupancy<'a> {
 }
 
 impl Occupancy<'_> {
+    /// XXH3-64 of the classes, by which results are compared at a glance. The same on every machine.
+    pub fn digest(&self) -> u64 {
+        digest::bytes(self.classes)
+    }
+
+    /// [`digest::floats`] of the logits, if the session keeps them. The same on every machine.
+    pub fn logits_digest(&self) -> Option<u64> {
+        self.logits.map(digest::floats)
+    }
+
     /// Bytes that [`Occupancy::write_bits`] fills.
     pub fn bits_len(&self) -> usize {
         self.classes.len().div_ceil(8)
