@@ -1,5 +1,6 @@
 //! Arguments and commands. One file per command under `cli/`.
 
+mod compare;
 mod demo;
 mod dump;
 mod frame;
@@ -50,6 +51,8 @@ enum Command {
     Inspect(inspect::Inspect),
     /// Time every operation of a model
     Profile(profile::Profile),
+    /// Compare two dumps or two runs, stage by stage
+    Compare(compare::Compare),
     /// Check that this machine computes what a model must give
     Selftest(selftest::SelfTest),
     /// Draw synthetic street scenes with labels
@@ -65,6 +68,7 @@ impl Arguments {
             Command::Run(command) => command.run(),
             Command::Inspect(command) => command.run(),
             Command::Profile(command) => command.run(),
+            Command::Compare(command) => command.run(),
             Command::Selftest(command) => command.run(),
             Command::Synth(command) => command.run(),
         }

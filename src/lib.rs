@@ -104,6 +104,7 @@ mod arena;
 pub mod camera;
 #[cfg(feature = "import")]
 pub mod checkpoint;
+pub mod compare;
 pub mod container;
 pub mod demo;
 pub mod digest;
