@@ -151,3 +151,6 @@ impl Synthesiser {
         frame
     }
 }
+
+#[cfg(test)]
+mod tests;
