@@ -102,6 +102,8 @@ import(&checkpoint, &network, Options::default(), Path::new("model.safetensors")
 
 mod arena;
 pub mod camera;
+#[cfg(feature = "capi")]
+mod capi;
 #[cfg(feature = "import")]
 pub mod checkpoint;
 pub mod compare;
