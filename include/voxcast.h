@@ -122,7 +122,7 @@ enum {
     VOXCAST_IO = 3,
     /* Bytes are not what the format says: truncated, corrupt, of another version, out of range. */
     VOXCAST_FORMAT = 4,
-    /* Sound input that does not belong here: a rig of another network, an image of another size, no such camera. */
+    /* Sound input that does not belong here: a rig of another network, an image of another size, a camera too many. */
     VOXCAST_MISMATCH = 5,
     /* Understood, and not available: an instruction set of another CPU, logits that the session does not keep. */
     VOXCAST_UNSUPPORTED = 6,
