@@ -492,7 +492,7 @@ int main(int argc, char **argv)
     voxcast_rig *rig;
     RETURNS(VOXCAST_OK, voxcast_rig_open(model, rig_path, CAMERAS, &rig, SAID));
     options_that_cannot_be(rig);
-    const voxcast_options options = { .size = sizeof options, .threads = 3, .logits = 1, .slice_cost = 20000 };
+    const voxcast_options options = { .size = sizeof options, .threads = 2, .logits = 1, .slice_cost = 300000 };
     voxcast_session *session, *plain;
     RETURNS(VOXCAST_OK, voxcast_session_new(model, rig, &options, &session, SAID));
     RETURNS(VOXCAST_OK, voxcast_session_new(model, rig, NULL, &plain, SAID));
