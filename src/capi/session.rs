@@ -61,7 +61,7 @@ unsafe extern "C" fn voxcast_session_new(
 }
 
 #[unsafe(no_mangle)]
-extern "C" fn voxcast_session_free(session: Option<Box<SessionHandle>>) {
+pub(super) extern "C" fn voxcast_session_free(session: Option<Box<SessionHandle>>) {
     free(session);
 }
 
@@ -114,7 +114,7 @@ unsafe extern "C" fn voxcast_session_run(
 /// # Safety
 /// The pointers are as `voxcast.h` says.
 #[unsafe(no_mangle)]
-unsafe extern "C" fn voxcast_session_step(
+pub(super) unsafe extern "C" fn voxcast_session_step(
     session: Option<&SessionHandle>,
     budget: i32,
     amount: u64,
