@@ -214,3 +214,26 @@ fn the_header_is_c99_and_cxx() {
     run(tool("gcc", "gcc").args(strict).args(["-std=c99", "-x", "c", header]));
     run(tool("g++", "g++").args(strict).args(["-std=c++11", "-x", "c++", header]));
 }
+
+/// The programs in the documentation.
+fn fences(text: &str) -> Vec<&str> {
+    let starts = text.split("\n```c\n").skip(1);
+    starts.map(|rest| rest.split_once("\n```").expect("fences end").0).collect()
+}
+
+#[test]
+fn programs_in_the_documentation_compile_and_link() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let directory = tempfile::tempdir().unwrap();
+    let mut programs = 0;
+    for page in ["README.md", "docs/embedding.md"] {
+        let text = std::fs::read_to_string(root.join(page)).unwrap();
+        for program in fences(&text) {
+            let file = directory.path().join(format!("program_{programs}.c"));
+            std::fs::write(&file, format!("{program}\n\nint main(void)\n{{\n    return 0;\n}}\n")).unwrap();
+            compile(file.to_str().unwrap(), Link::Shared, directory.path());
+            programs += 1;
+        }
+    }
+    assert!(programs > 0);
+}
