@@ -12,7 +12,8 @@
  *     cc -std=c11 -Iinclude infer.c -Ltarget/release -lvoxcast -o infer
  *     LD_LIBRARY_PATH=target/release ./infer
  *
- * makes libvoxcast.so and a program that uses it. With `--crate-type staticlib` it is libvoxcast.a, which is linked with
+ * makes libvoxcast.so and a program that uses it. With `--crate-type staticlib` it is libvoxcast.a, which is linked
+ * with
  *
  *     cc -std=c11 -Iinclude infer.c target/release/libvoxcast.a -lpthread -ldl -lm -o infer
  *
@@ -44,8 +45,8 @@
  *
  * Message.    Their last two arguments are room for one line of text that says what went wrong: which file, what was
  *             found, what was expected. At most `capacity` bytes are written, a NUL always among them; longer lines are
- *             cut between characters (UTF-8). It is the empty string where nothing went wrong. `message` may be NULL and
- *             `capacity` 0. VOXCAST_MESSAGE bytes hold nearly every line.
+ *             cut between characters (UTF-8). It is the empty string where nothing went wrong. `message` may be NULL
+ *             and `capacity` 0. VOXCAST_MESSAGE bytes hold nearly every line.
  *
  * Handles.    voxcast_model, voxcast_rig, voxcast_rig_builder and voxcast_session are made by functions whose name ends
  *             in _open, _from_bytes, _new or _build, which write the handle, or NULL where they fail, to the place that
@@ -68,9 +69,9 @@
  *             constants and misaligned arrays. Pointers to memory that is not there, handles that were freed and
  *             capacities that are not true cannot be recognised.
  *
- * Threads.    Every function may be called from every thread. Models may be used by many calls at once; a session, a rig
- *             or a rig builder by one at a time. A call that finds another inside of the same handle does not wait: it
- *             returns VOXCAST_BUSY and has done nothing. So no call blocks, and a mutex, if one is needed, is the
+ * Threads.    Every function may be called from every thread. Models may be used by many calls at once; a session, a
+ *             rig or a rig builder by one at a time. A call that finds another inside of the same handle does not wait:
+ *             it returns VOXCAST_BUSY and has done nothing. So no call waits for another, and a mutex, if one is needed, is the
  *             caller's. Freeing is the exception: nobody else may be using the handle, or use it later.
  *             A session computes on the thread that calls it and on the threads that its options ask for. They wait,
  *             after a short spin, when there is no work, and end with the session. After fork() only a process that is
@@ -87,9 +88,10 @@
  *             environment must be the default one: round to nearest, no flush to zero.
  *
  * Bugs.       A panic of the Rust code does not cross this interface. The call returns VOXCAST_INTERNAL, and the handle
- *             that it was changing answers VOXCAST_POISONED from then on; it can be freed. Rust's panic hook writes a line to
- *             stderr; nothing else in the library prints, reads the environment or exits. An allocation that the system
- *             refuses is VOXCAST_TOO_LARGE where it is large; where it is small the process aborts, as Rust has it.
+ *             that it was changing answers VOXCAST_POISONED from then on; it can be freed. Rust's panic hook writes a
+ *             line to stderr; nothing else in the library prints, reads the environment or exits. An allocation that
+ *             the system refuses is VOXCAST_TOO_LARGE where it is large; where it is small the process aborts, as Rust
+ *             has it.
  */
 
 #ifndef VOXCAST_H
@@ -170,7 +172,7 @@ const char *voxcast_status_name(voxcast_status status);
  *
  * path     NUL-terminated, in the system's encoding (UTF-8 outside of Unix).
  * Fails    VOXCAST_IO, VOXCAST_FORMAT.
- * Allocates what the file's header needs: some hundred kilobytes. The weights stay where they are mapped.
+ * Allocates what the file's header needs. The weights stay where they are mapped.
  */
 voxcast_status voxcast_model_open(const char *path, voxcast_model **model, char *message, size_t capacity);
 
@@ -285,8 +287,8 @@ voxcast_status voxcast_rig_builder_build(
 size_t voxcast_rig_builder_steps(const voxcast_rig_builder *builder);
 
 /*
- * Begins to rebuild a rig for another calibration in bounded steps, which voxcast_rig_builder_advance does. One that was
- * under way is dropped. Arguments and failures are those of voxcast_rig_builder_build.
+ * Begins to rebuild a rig for another calibration in bounded steps, which voxcast_rig_builder_advance does. One that
+ * was under way is dropped. Arguments and failures are those of voxcast_rig_builder_build.
  *
  * Allocates nothing once builder and rigs have grown to what the calibrations at hand need: see the next function.
  */
@@ -373,8 +375,8 @@ voxcast_status voxcast_session_run(
     voxcast_session *session, const voxcast_image *images, size_t count, char *message, size_t capacity);
 
 /*
- * Copies the next image of one camera, from 0. Its backbone runs with the next steps. Where the image before has not been
- * begun, it is replaced.
+ * Copies the next image of one camera, from 0. Its backbone runs with the next steps. Where the image before has not
+ * been begun, it is replaced.
  *
  * Fails    VOXCAST_MISMATCH if there is no such camera or the size is wrong.
  * Allocates nothing.
@@ -418,9 +420,9 @@ voxcast_status voxcast_session_step(
     voxcast_session *session, int32_t budget, uint64_t amount, int32_t *step, char *message, size_t capacity);
 
 /*
- * Leaves a camera out (masked 1), or takes it in again (0): a camera that has failed or is dirty. The result has the bits
- * of a rig without it. It needs no image then, and its backbone does not run. Takes effect at once; a fusion that is
- * under way starts again.
+ * Leaves a camera out (masked 1), or takes it in again (0): a camera that has failed or is dirty. The result has the
+ * bits of a rig without it. It needs no image then, and its backbone does not run. Takes effect at once; a fusion that
+ * is under way starts again.
  *
  * Fails    VOXCAST_MISMATCH if there is no such camera.
  * Allocates nothing.
@@ -456,8 +458,8 @@ voxcast_status voxcast_session_classes(
     voxcast_session *session, uint8_t *classes, size_t room, size_t *length, char *message, size_t capacity);
 
 /*
- * The logits of each voxel, its classes side by side: voxel v and class k at v * classes + k. The length is voxels times
- * classes, which is much to copy.
+ * The logits of each voxel, its classes side by side: voxel v and class k at v * classes + k. The length is voxels
+ * times classes, which is much to copy.
  *
  * Fails    VOXCAST_UNSUPPORTED if the session's options did not ask for logits.
  */
@@ -465,15 +467,15 @@ voxcast_status voxcast_session_logits(
     voxcast_session *session, float *logits, size_t room, size_t *length, char *message, size_t capacity);
 
 /*
- * By how many feature pixels each voxel is seen, masked cameras left out, at most 65535. Where it is 0 no camera sees the
- * place and the class is a guess from the surroundings: not "free" but "unknown". The length is `voxels`.
+ * By how many feature pixels each voxel is seen, masked cameras left out, at most 65535. Where it is 0 no camera sees
+ * the place and the class is a guess from the surroundings: not "free" but "unknown". The length is `voxels`.
  */
 voxcast_status voxcast_session_support(
     voxcast_session *session, uint16_t *support, size_t room, size_t *length, char *message, size_t capacity);
 
 /*
- * One bit per voxel, whether its class is not 0: voxel v is bit v % 8, counted from the lowest, of byte v / 8. Bits after
- * the last voxel are 0. The length is voxels / 8, rounded up.
+ * One bit per voxel, whether its class is not 0: voxel v is bit v % 8, counted from the lowest, of byte v / 8. Bits
+ * after the last voxel are 0. The length is voxels / 8, rounded up.
  */
 voxcast_status voxcast_session_bits(
     voxcast_session *session, uint8_t *bits, size_t room, size_t *length, char *message, size_t capacity);
@@ -495,8 +497,8 @@ voxcast_status voxcast_session_cameras(
     voxcast_session *session, voxcast_camera *cameras, size_t room, size_t *length, char *message, size_t capacity);
 
 /*
- * The XXH3-64 of the classes, by which results are compared at a glance. In 16 hexadecimal digits it is what the program
- * `voxcast` prints.
+ * The XXH3-64 of the classes, by which results are compared at a glance. In 16 hexadecimal digits it is what the
+ * program `voxcast` prints.
  */
 voxcast_status voxcast_session_digest(voxcast_session *session, uint64_t *digest, char *message, size_t capacity);
 

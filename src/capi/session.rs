@@ -16,6 +16,9 @@ use std::time::Duration;
 /// `voxcast_session`.
 pub(super) struct SessionHandle(pub(super) Mutex<Session>);
 
+// What the header says of it.
+const _: () = assert!(size_of::<SessionHandle>() < 4096);
+
 /// # Safety
 /// The pointers are as `voxcast.h` says.
 #[unsafe(no_mangle)]
