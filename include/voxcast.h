@@ -71,8 +71,8 @@
  *
  * Threads.    Every function may be called from every thread. Models may be used by many calls at once; a session, a
  *             rig or a rig builder by one at a time. A call that finds another inside of the same handle does not wait:
- *             it returns VOXCAST_BUSY and has done nothing. So no call waits for another, and a mutex, if one is needed, is the
- *             caller's. Freeing is the exception: nobody else may be using the handle, or use it later.
+ *             it returns VOXCAST_BUSY and has done nothing. A mutex, if one is needed, is the caller's. Freeing is the
+ *             exception: nobody else may be using the handle, or use it later.
  *             A session computes on the thread that calls it and on the threads that its options ask for. They wait,
  *             after a short spin, when there is no work, and end with the session. After fork() only a process that is
  *             the parent may go on using handles.

@@ -495,13 +495,17 @@ int main(int argc, char **argv)
     const voxcast_options options = { .size = sizeof options, .threads = 2, .logits = 1, .slice_cost = 300000 };
     voxcast_session *session, *plain;
     RETURNS(VOXCAST_OK, voxcast_session_new(model, rig, &options, &session, SAID));
-    RETURNS(VOXCAST_OK, voxcast_session_new(model, rig, NULL, &plain, SAID));
+    const voxcast_options scalar = { .size = sizeof scalar, .isa = "scalar" };
+    RETURNS(VOXCAST_OK, voxcast_session_new(model, rig, &scalar, &plain, SAID));
     RETURNS(VOXCAST_UNSUPPORTED, voxcast_session_logits(plain, NULL, 0, &length, SAID));
+    RETURNS(VOXCAST_OK, voxcast_session_run(plain, images, CAMERAS, SAID));
+    const uint64_t specified = digest_of(plain);
     voxcast_session_free(plain);
     images_that_cannot_be(session);
     before_the_first_frame(session);
     RETURNS(VOXCAST_OK, voxcast_session_run(session, images, CAMERAS, SAID));
     const uint64_t digest = digest_of(session);
+    CHECK(digest == specified);
     results(session);
     other_ways(session, digest);
     masks(session, digest);
