@@ -24,6 +24,7 @@
  *
  *     voxcast_abi                                     is the library the one of this header?
  *     voxcast_model_open                              weights; voxcast_model_network tells sizes
+ *     voxcast_model_selftest                          at power-on: does this machine compute what it must?
  *     voxcast_rig_open, or                            the cameras' projection matrices, from a file
  *       voxcast_rig_builder_new, ..._build            or from their calibration
  *     voxcast_session_memory                          what the next call will take
@@ -137,7 +138,9 @@ enum {
     /* An earlier call has returned VOXCAST_INTERNAL. The handle can only be freed. */
     VOXCAST_POISONED = 10,
     /* A bug in voxcast. Please report the message. */
-    VOXCAST_INTERNAL = 11
+    VOXCAST_INTERNAL = 11,
+    /* The machine, the build or the model's bytes do not compute what the model says that they must. */
+    VOXCAST_SELFTEST_FAILED = 12
 };
 
 /* Weights and the network that they belong to. Never changes; any number of threads may use it at once. */
@@ -236,6 +239,18 @@ typedef struct voxcast_options {
      */
     uint64_t slice_cost;
 } voxcast_options;
+
+/*
+ * The power-on self-test: runs the stimulus that a model carries and compares every operation's result, in bits, with
+ * what it must be. It takes the time of a frame of two cameras.
+ *
+ * options  the threads and the instruction set to test.
+ * Fails    VOXCAST_SELFTEST_FAILED, with the first wrong operation and its stage in the message; VOXCAST_UNSUPPORTED if
+ *          the model carries no self-test; VOXCAST_FORMAT if it carries a malformed one; VOXCAST_TOO_LARGE.
+ * Allocates a session for two cameras, with logits, and frees it again.
+ */
+voxcast_status voxcast_model_selftest(
+    const voxcast_model *model, const voxcast_options *options, char *message, size_t capacity);
 
 
 /* ---- Rigs ------------------------------------------------------------------------------------------------------- */
@@ -501,6 +516,14 @@ voxcast_status voxcast_session_cameras(
  * program `voxcast` prints.
  */
 voxcast_status voxcast_session_digest(voxcast_session *session, uint64_t *digest, char *message, size_t capacity);
+
+/*
+ * The XXH3-64 of the logits as little-endian bytes, which is as long to compute as they are to read.
+ *
+ * Fails    VOXCAST_UNSUPPORTED if the session's options did not ask for logits.
+ */
+voxcast_status voxcast_session_logits_digest(
+    voxcast_session *session, uint64_t *digest, char *message, size_t capacity);
 
 /*
  * The longest time that a slice of voxcast_session_step took since the session was made, and the name of the operation

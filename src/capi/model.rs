@@ -1,9 +1,11 @@
 //! Models and what is known of their networks.
 
+use super::options;
 use super::pointers::{array, path, write_sized};
-use super::status::{call, free, given, invalid, make};
-use super::types::Network;
+use super::status::{Failure, call, free, given, invalid, make};
+use super::types::{Network, Options, Status};
 use crate::model::Model;
+use crate::selftest;
 use std::ffi::{c_char, c_void};
 use std::mem::MaybeUninit;
 use std::sync::Arc;
@@ -82,6 +84,26 @@ unsafe extern "C" fn voxcast_model_network(
         };
         // SAFETY: `network` is null or a struct of the size that it says, as the header asks of the caller.
         unsafe { write_sized(network, &value, "network") }
+    };
+    // SAFETY: `message` is null or has room, as the header asks of the caller.
+    unsafe { call(message, capacity, body) }
+}
+
+/// # Safety
+/// The pointers are as `voxcast.h` says.
+#[unsafe(no_mangle)]
+unsafe extern "C" fn voxcast_model_selftest(
+    model: Option<&ModelHandle>,
+    options: *const Options,
+    message: *mut c_char,
+    capacity: usize,
+) -> i32 {
+    let body = || {
+        let model = &given(model, "model")?.0;
+        // SAFETY: `options` is null or a struct of the size that it says, as the header asks of the caller.
+        let options = unsafe { options::read(options) }?;
+        let fault = selftest::run(model, options.isa, &options.threads)?.fault;
+        fault.map_or(Ok(()), |fault| Err(Failure::new(Status::SelftestFailed, fault.to_string())))
     };
     // SAFETY: `message` is null or has room, as the header asks of the caller.
     unsafe { call(message, capacity, body) }

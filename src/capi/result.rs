@@ -35,6 +35,10 @@ fn result(session: &Session) -> Outcome<Occupancy<'_>> {
     session.occupancy().ok_or_else(|| Failure::new(Status::NoResult, "no frame is complete yet"))
 }
 
+fn no_logits() -> Failure {
+    Failure::new(Status::Unsupported, "the session keeps no logits: its options did not ask for them")
+}
+
 fn voxels(session: &Session) -> usize {
     session.model().network().output_grid().iter().product()
 }
@@ -73,11 +77,8 @@ unsafe extern "C" fn voxcast_session_logits(
     capacity: usize,
 ) -> i32 {
     let numbers = |session: &Session| {
-        if !session.keeps_logits() {
-            let text = "the session keeps no logits: its options did not ask for them";
-            return Err(Failure::new(Status::Unsupported, text));
-        }
-        Ok(voxels(session) * session.model().network().classes)
+        let numbers = voxels(session) * session.model().network().classes;
+        session.keeps_logits().then_some(numbers).ok_or_else(no_logits)
     };
     let write = |o: Occupancy<'_>, out: &mut [MaybeUninit<f32>]| put(out, o.logits.unwrap_or_default().iter().copied());
     // SAFETY: `logits` and `message` are null or have room, as the header asks of the caller.
@@ -149,7 +150,25 @@ unsafe extern "C" fn voxcast_session_digest(
 ) -> i32 {
     let body = || {
         let session = own(&given(session, "session")?.0, "session")?;
-        given(digest, "digest")?.write(xxhash_rust::xxh3::xxh3_64(result(&session)?.classes));
+        given(digest, "digest")?.write(result(&session)?.digest());
+        Ok(())
+    };
+    // SAFETY: `message` is null or has room, as the header asks of the caller.
+    unsafe { call(message, capacity, body) }
+}
+
+/// # Safety
+/// The pointers are as `voxcast.h` says.
+#[unsafe(no_mangle)]
+unsafe extern "C" fn voxcast_session_logits_digest(
+    session: Option<&SessionHandle>,
+    digest: Option<&mut MaybeUninit<u64>>,
+    message: *mut c_char,
+    capacity: usize,
+) -> i32 {
+    let body = || {
+        let session = own(&given(session, "session")?.0, "session")?;
+        given(digest, "digest")?.write(result(&session)?.logits_digest().ok_or_else(no_logits)?);
         Ok(())
     };
     // SAFETY: `message` is null or has room, as the header asks of the caller.

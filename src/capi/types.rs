@@ -22,11 +22,12 @@ pub(crate) enum Status {
     Busy = 9,
     Poisoned = 10,
     Internal = 11,
+    SelftestFailed = 12,
 }
 
 impl Status {
     /// Every status with its name in the header.
-    pub(crate) const NAMES: [(Self, &'static std::ffi::CStr); 12] = [
+    pub(crate) const NAMES: [(Self, &'static std::ffi::CStr); 13] = [
         (Self::Ok, c"VOXCAST_OK"),
         (Self::InvalidArgument, c"VOXCAST_INVALID_ARGUMENT"),
         (Self::BufferTooSmall, c"VOXCAST_BUFFER_TOO_SMALL"),
@@ -39,6 +40,7 @@ impl Status {
         (Self::Busy, c"VOXCAST_BUSY"),
         (Self::Poisoned, c"VOXCAST_POISONED"),
         (Self::Internal, c"VOXCAST_INTERNAL"),
+        (Self::SelftestFailed, c"VOXCAST_SELFTEST_FAILED"),
     ];
 }
 

@@ -2,9 +2,10 @@
  * What voxcast.h promises beyond examples/infer.c, statement by statement: misuse, sizes, steps, masks, rigs, threads,
  * and that frames allocate nothing. Linked with --wrap for the functions that allocate, so that they can be counted.
  *
- *     conformance MODEL RIG IMAGES HEIGHT WIDTH MATRICES
+ *     conformance MODEL RIG IMAGES HEIGHT WIDTH MATRICES FAULTY MUTE
  *
- * IMAGES holds two blue-first images, MATRICES two 4x4 matrices of f32, both raw. Prints the digest of the frame.
+ * IMAGES holds two blue-first images, MATRICES two 4x4 matrices of f32, both raw. FAULTY is the model with a self-test
+ * that cannot pass, MUTE the model without one. Prints the digests of classes and logits.
  */
 
 #include "voxcast.h"
@@ -78,7 +79,7 @@ int __wrap_posix_memalign(void **place, size_t alignment, size_t size)
 }
 
 /* The arguments, and what was made of them. */
-static const char *model_path, *rig_path;
+static const char *model_path, *rig_path, *faulty_path, *mute_path;
 static voxcast_image images[CAMERAS];
 static float matrices[CAMERAS * 16];
 static voxcast_model *model;
@@ -160,6 +161,22 @@ static void models(void)
     CHECK(network.voxels == network.grid[0] * network.grid[1] * network.grid[2] && network.grid[0] != network.grid[1]);
     CHECK(network.bounds[0][0] == -50 && network.bounds[1][1] == 40 && network.bounds[2][1] == 3);
     CHECK((images[0].height + 31) / 32 * 32 == network.height && (images[0].width + 31) / 32 * 32 == network.width);
+}
+
+static void self_tests(void)
+{
+    voxcast_model *other;
+    const voxcast_options options = { .size = sizeof options, .isa = "scalar", .threads = 2 };
+    RETURNS(VOXCAST_OK, voxcast_model_selftest(model, NULL, SAID));
+    RETURNS(VOXCAST_OK, voxcast_model_selftest(model, &options, SAID));
+    RETURNS(VOXCAST_INVALID_ARGUMENT, voxcast_model_selftest(NULL, NULL, SAID));
+    RETURNS(VOXCAST_OK, voxcast_model_open(faulty_path, &other, SAID));
+    RETURNS(VOXCAST_SELFTEST_FAILED, voxcast_model_selftest(other, NULL, SAID));
+    CHECK(strstr(message, "operation classes"));
+    voxcast_model_free(other);
+    RETURNS(VOXCAST_OK, voxcast_model_open(mute_path, &other, SAID));
+    RETURNS(VOXCAST_UNSUPPORTED, voxcast_model_selftest(other, NULL, SAID));
+    voxcast_model_free(other);
 }
 
 static void structs_of_other_sizes(void)
@@ -263,6 +280,7 @@ static void before_the_first_frame(voxcast_session *session)
     voxcast_camera cameras[CAMERAS];
     RETURNS(VOXCAST_NO_RESULT, voxcast_session_cameras(session, cameras, CAMERAS, NULL, SAID));
     RETURNS(VOXCAST_NO_RESULT, voxcast_session_digest(session, &number, SAID));
+    RETURNS(VOXCAST_NO_RESULT, voxcast_session_logits_digest(session, &number, SAID));
     RETURNS(VOXCAST_NO_RESULT, voxcast_session_longest_slice(session, &number, NULL, 0, SAID));
     RETURNS(VOXCAST_BUFFER_TOO_SMALL, voxcast_session_classes(session, &byte, 1, NULL, SAID));
     CHECK(byte == 7);
@@ -468,10 +486,12 @@ static void several_threads(voxcast_session *session, uint64_t expected)
 
 int main(int argc, char **argv)
 {
-    if (argc != 7)
+    if (argc != 9)
         return 2;
     model_path = argv[1];
     rig_path = argv[2];
+    faulty_path = argv[7];
+    mute_path = argv[8];
     size_t length;
     uint8_t *pixels = read_file(argv[3], &length), *bytes;
     const size_t height = strtoul(argv[4], NULL, 10), width = strtoul(argv[5], NULL, 10), image = 3 * height * width;
@@ -488,6 +508,7 @@ int main(int argc, char **argv)
     the_library();
     messages();
     models();
+    self_tests();
     structs_of_other_sizes();
     voxcast_rig *rig;
     RETURNS(VOXCAST_OK, voxcast_rig_open(model, rig_path, CAMERAS, &rig, SAID));
@@ -500,12 +521,15 @@ int main(int argc, char **argv)
     RETURNS(VOXCAST_UNSUPPORTED, voxcast_session_logits(plain, NULL, 0, &length, SAID));
     RETURNS(VOXCAST_OK, voxcast_session_run(plain, images, CAMERAS, SAID));
     const uint64_t specified = digest_of(plain);
+    uint64_t of_logits;
+    RETURNS(VOXCAST_UNSUPPORTED, voxcast_session_logits_digest(plain, &of_logits, SAID));
     voxcast_session_free(plain);
     images_that_cannot_be(session);
     before_the_first_frame(session);
     RETURNS(VOXCAST_OK, voxcast_session_run(session, images, CAMERAS, SAID));
     const uint64_t digest = digest_of(session);
     CHECK(digest == specified);
+    RETURNS(VOXCAST_OK, voxcast_session_logits_digest(session, &of_logits, SAID));
     results(session);
     other_ways(session, digest);
     masks(session, digest);
@@ -516,6 +540,6 @@ int main(int argc, char **argv)
     several_threads(session, digest);
     voxcast_session_free(session);
     free(pixels);
-    printf("digest %016" PRIx64 "\n", digest);
+    printf("digest %016" PRIx64 ", of logits %016" PRIx64 "\n", digest, of_logits);
     return failures != 0;
 }

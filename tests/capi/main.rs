@@ -16,11 +16,12 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::Arc;
+use voxcast::container::{self, Container, Data, Layout, Tensor};
 use voxcast::graph::Rewrites;
 use voxcast::import::import;
 use voxcast::model::Options;
 use voxcast::weights::Precision;
-use voxcast::{ImageView, Model, Network, Session, SessionOptions};
+use voxcast::{ImageView, Isa, Model, Network, Session, SessionOptions, Threads, selftest};
 
 /// A network that is small enough for valgrind.
 fn network() -> Network {
@@ -41,6 +42,7 @@ struct Files {
     images: Vec<PathBuf>,
     size: [usize; 2],
     digest: String,
+    logits_digest: String,
 }
 
 impl Files {
@@ -50,6 +52,9 @@ impl Files {
         let network = network();
         let options = Options { precision: Precision::F32, rewrites: Rewrites::ALL };
         import(&small::Weights(1), &network, options, &path("model"), &mut |_, _| ()).unwrap();
+        std::fs::copy(path("model"), path("mute")).unwrap();
+        selftest::record(&path("model"), Isa::best(), &Threads::calling()).unwrap();
+        damage_self_test(&path("model"), &path("faulty"));
         let model = Arc::new(Model::open(&path("model")).unwrap());
         let rig = small::rig(&network, 0.3);
         rig.save(&path("rig"), &network).unwrap();
@@ -59,10 +64,12 @@ impl Files {
             small::lidar2img(&network, 0.3).as_flattened().iter().flat_map(|v| v.to_ne_bytes()).collect();
         std::fs::write(path("matrices"), matrices).unwrap();
         std::fs::write(path("images"), images.iter().flat_map(|i| i.pixels).copied().collect::<Vec<u8>>()).unwrap();
-        let mut session = Session::new(model, rig, &SessionOptions::default()).unwrap();
-        let classes = session.run(&images).unwrap().classes;
+        let options = SessionOptions { logits: true, ..SessionOptions::default() };
+        let mut session = Session::new(model, rig, &options).unwrap();
+        let result = session.run(&images).unwrap();
         Self {
-            digest: format!("digest {:016x}", xxhash_rust::xxh3::xxh3_64(classes)),
+            digest: format!("digest {:016x}", result.digest()),
+            logits_digest: format!("of logits {:016x}", result.logits_digest().unwrap()),
             images: images.iter().enumerate().map(|(i, view)| ppm(&path(&format!("{i}.ppm")), view)).collect(),
             size: [images[0].height, images[0].width],
             directory,
@@ -81,13 +88,31 @@ impl Files {
     /// `command` with the arguments of `conformance.c`.
     fn conformance<'a>(&self, command: &'a mut Command) -> &'a mut Command {
         command.args(["model", "rig", "images"].map(|name| self.path(name)));
-        command.args(self.size.map(|side| side.to_string())).arg(self.path("matrices"))
+        command
+            .args(self.size.map(|side| side.to_string()))
+            .args(["matrices", "faulty", "mute"].map(|name| self.path(name)))
     }
 
-    fn assert_digest(&self, command: &mut Command) {
+    fn assert_digest(&self, command: &mut Command) -> String {
         let found = String::from_utf8(run(command).stdout).unwrap();
         assert!(found.contains(&self.digest), "{command:?}: {found}, expected {}", self.digest);
+        found
     }
+}
+
+/// Copies a model and changes what its self-test says of the classes.
+fn damage_self_test(from: &Path, to: &Path) {
+    let model = Container::open(from).unwrap();
+    let mut metadata = model.metadata().clone();
+    let test = metadata.get_mut(selftest::KEY).unwrap();
+    let mut value: selftest::SelfTest = serde_json::from_str(test).unwrap();
+    value.classes = "0123456789abcdef".to_owned();
+    *test = serde_json::to_string(&value).unwrap();
+    let tensors = model.names().into_iter().map(|name| {
+        let (dtype, shape, bytes) = model.tensor(&name).unwrap();
+        Tensor { dtype, shape: shape.to_vec(), data: Data::Bytes(bytes), name }
+    });
+    container::write(to, tensors.collect(), &metadata, Layout::Aligned).unwrap();
 }
 
 /// Writes a binary PPM and says where.
@@ -130,8 +155,10 @@ fn the_example_says_what_is_wrong() {
 fn every_promise_of_the_header_holds_natively_and_under_valgrind() {
     let files = Files::new();
     let program = compile("tests/capi/conformance.c", Link::Archive { wrapped: true }, files.directory.path());
-    files.assert_digest(files.conformance(&mut Command::new(&program)));
-    files.assert_digest(files.conformance(&mut under_valgrind(&program)));
+    for command in [&mut Command::new(&program), &mut under_valgrind(&program)] {
+        let found = files.assert_digest(files.conformance(command));
+        assert!(found.contains(&files.logits_digest), "{found}, expected {}", files.logits_digest);
+    }
 }
 
 /// Names that a library defines for others.
