@@ -97,11 +97,14 @@ import(&checkpoint, &network, Options::default(), Path::new("model.safetensors")
 //! | `import` | `checkpoint`: reading `.pth` and `.safetensors` |
 //! | `images` | `picture`, and JPEG and PNG in [`Scene::open`] and `Scene::save` |
 //! | `npz` | `npz`: NumPy's `.npz`, written and read |
+//! | `capi` | the functions of `include/voxcast.h`, for C; see `docs/embedding.md` |
 //!
 //! Without features the library reads models, rigs and `.safetensors` scenes, and runs them.
 
 mod arena;
 pub mod camera;
+#[cfg(feature = "capi")]
+mod capi;
 #[cfg(feature = "import")]
 pub mod checkpoint;
 pub mod compare;

@@ -195,6 +195,12 @@ impl Session {
         }
     }
 
+    /// Whether results have logits.
+    #[cfg(feature = "capi")]
+    pub(crate) fn keeps_logits(&self) -> bool {
+        self.keep_logits
+    }
+
     /// Cameras of a frame.
     pub fn cameras(&self) -> usize {
         self.cameras.len()
@@ -304,16 +310,25 @@ impl Session {
         images: &[ImageView<'_>],
         observer: &mut (dyn FnMut(Event<'_>) + Send),
     ) -> Result<Occupancy<'_>> {
+        self.run_each(images.iter().copied(), observer)
+    }
+
+    /// [`Session::run_observed`] on images that need not lie side by side.
+    pub(crate) fn run_each<'a>(
+        &mut self,
+        images: impl ExactSizeIterator<Item = ImageView<'a>> + Clone,
+        observer: &mut (dyn FnMut(Event<'_>) + Send),
+    ) -> Result<Occupancy<'_>> {
         let count = self.cameras.len();
         if images.len() != count {
             return Err(Error::mismatch(format!("{} images, the rig has {count} cameras", images.len())));
         }
-        for (camera, image) in images.iter().enumerate() {
+        for (camera, image) in images.clone().enumerate() {
             image.check(camera, self.model.network().image)?;
         }
         self.frame.restart(&mut self.cameras);
         for (camera, image) in self.cameras.iter_mut().zip(images) {
-            camera.receive(image);
+            camera.receive(&image);
         }
         let step = self.step_observed(Budget::Unlimited, observer);
         debug_assert_eq!(step, Step::Complete, "every camera has a new image");

@@ -452,6 +452,18 @@ fn any_schedule_gives_the_bits_of_whole_frames() {
     assert!(results.get() > 100, "{} results", results.get());
 }
 
+/// What may be handed from thread to thread, and what may be shared. Compiling is the test.
+const _: () = {
+    const fn sent<T: Send>() {}
+    const fn shared<T: Send + Sync>() {}
+    sent::<Session>();
+    sent::<RigBuilder>();
+    shared::<Model>();
+    shared::<Rig>();
+    shared::<Threads>();
+    shared::<SessionOptions>();
+};
+
 #[test]
 fn sessions_move_between_threads() {
     fn send<T: Send>(value: T) -> T {

@@ -45,9 +45,13 @@ impl Occupancy<'_> {
     /// If `out` is not [`Occupancy::bits_len`] long.
     pub fn write_bits(&self, out: &mut [u8]) {
         assert_eq!(out.len(), self.bits_len(), "bytes for one bit per voxel");
-        for (byte, classes) in out.iter_mut().zip(self.classes.chunks(8)) {
-            *byte = classes.iter().rev().fold(0, |bits, &class| bits << 1 | u8::from(class != 0));
-        }
+        out.iter_mut().zip(self.bits()).for_each(|(out, byte)| *out = byte);
+    }
+
+    /// What [`Occupancy::write_bits`] writes.
+    pub(crate) fn bits(&self) -> impl Iterator<Item = u8> {
+        let byte = |classes: &[u8]| classes.iter().rev().fold(0, |bits, &class| bits << 1 | u8::from(class != 0));
+        self.classes.chunks(8).map(byte)
     }
 }
 
