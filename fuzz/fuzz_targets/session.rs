@@ -102,10 +102,8 @@ fn model(input: &mut Input<'_>, network: &Network) -> Option<Arc<Model>> {
     let rewrites = [Rewrites::ALL, Rewrites::NONE, Rewrites { projection: false, ..Rewrites::ALL }];
     let rewrites = rewrites[input.extent(0, 2)];
     let precision = if input.flag() { Precision::F16 } else { Precision::F32 };
-    let source = Weights {
-        seed: u64::from(input.byte()),
-        factor: [1.0, 1.0, 0.0, 1e3, 1e18, -1e30][input.extent(0, 5)],
-    };
+    let source =
+        Weights { seed: u64::from(input.byte()), factor: [1.0, 1.0, 0.0, 1e3, 1e18, -1e30][input.extent(0, 5)] };
     for rewrites in [Rewrites::NONE, rewrites] {
         let graph = Graph::build(network, true).rewritten(rewrites);
         if !is_small(&graph) {
@@ -194,13 +192,10 @@ impl Bench {
     /// The session's result is a whole frame of a fresh session of the scalar code.
     fn check(&self, session: &Session, told: &Told) {
         let found = session.occupancy().expect("a result");
-        let options = SessionOptions {
-            isa: Isa::Scalar,
-            unfolded: self.unfolded,
-            logits: true,
-            ..SessionOptions::default()
-        };
-        let mut fresh = Session::new(self.model.clone(), self.rigs[told.rig].clone(), &options).expect("a small session");
+        let options =
+            SessionOptions { isa: Isa::Scalar, unfolded: self.unfolded, logits: true, ..SessionOptions::default() };
+        let mut fresh =
+            Session::new(self.model.clone(), self.rigs[told.rig].clone(), &options).expect("a small session");
         let images: Vec<ImageView<'_>> = (0..told.given.len())
             .map(|camera| {
                 let status = found.cameras[camera];

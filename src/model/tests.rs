@@ -57,6 +57,31 @@ fn refused(edit: impl FnOnce(&mut Vec<Loose>, &mut BTreeMap<String, String>), ex
 }
 
 #[test]
+fn bytes_may_start_anywhere() {
+    let file = sound(Options::default());
+    for start in 0..4 {
+        let bytes: &'static [u8] = [&vec![0; start][..], &file].concat().leak();
+        let model = Model::from_bytes(&bytes[start..]).unwrap_or_else(|e| panic!("from byte {start}: {e}"));
+        assert_eq!(model.container.bytes(), file);
+    }
+}
+
+#[test]
+fn a_model_that_was_read_needs_no_file() {
+    let directory = tempfile::tempdir().expect("a place");
+    let path = directory.path().join("model");
+    let file = sound(Options::default());
+    std::fs::write(&path, &file).expect("room");
+    let model = Model::read(&path).expect("sound");
+    let cut = std::fs::OpenOptions::new().write(true).open(&path).and_then(|f| f.set_len(100));
+    cut.expect("a file of our own");
+    assert_eq!((model.container.bytes(), model.path()), (&file[..], Some(&*path)));
+    for error in [Model::read(&path), Model::open(&path)].map(|again| again.expect_err("a cut file")) {
+        assert_eq!((error.kind(), error.path()), (ErrorKind::Format, Some(&*path)));
+    }
+}
+
+#[test]
 fn models_say_what_they_are() {
     for precision in [Precision::F32, Precision::F16] {
         for rewrites in [Rewrites::ALL, Rewrites::NONE, Rewrites { projection: false, ..Rewrites::ALL }] {
