@@ -96,10 +96,11 @@ mod tests {
 
     #[test]
     fn bytes_of_any_alignment_start_at_an_element() {
-        let bytes: &'static [u8] = (0..100).collect::<Vec<u8>>().leak();
+        static BYTES: [u8; 100] =
+            *b"0123456789012345678901234567890123456789012345678901234567890123456789012345678901234567890123456789";
         let mut copies = 0;
         for (from, to) in (0..8).flat_map(|from| [(from, 100), (from, 72), (from, from)]) {
-            let part = &bytes[from..to];
+            let part = &BYTES[from..to];
             let backing = Backing::from_bytes(Cow::Borrowed(part)).unwrap();
             assert_eq!(backing[..], *part);
             assert!(backing.as_ptr().addr().is_multiple_of(ELEMENT), "{from}..{to}");
