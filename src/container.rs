@@ -11,14 +11,13 @@
 //! whole file with those digits as `0`. Whoever has the key must be right; files whose `"format"` starts with `voxcast-`
 //! must have the key, so that no damage can hide it. Other safetensors files need neither.
 
+use crate::backing::Backing;
 use crate::error::{Error, ErrorKind, Result};
 use crate::replace::Replacement;
-use memmap2::Mmap;
 use safetensors::Dtype;
 use safetensors::tensor::Metadata;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
-use std::fs::{self, File};
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::path::Path;
 use xxhash_rust::xxh3::Xxh3;
@@ -176,22 +175,6 @@ fn checksum_digits(header: &[u8]) -> Option<usize> {
     (header.get(at + ZEROS.len()) == Some(&b'"')).then_some(at)
 }
 
-/// The bytes of a container.
-enum Backing {
-    Mapped(Mmap),
-    Bytes(Cow<'static, [u8]>),
-}
-
-impl std::ops::Deref for Backing {
-    type Target = [u8];
-    fn deref(&self) -> &[u8] {
-        match self {
-            Backing::Mapped(map) => map,
-            Backing::Bytes(bytes) => bytes,
-        }
-    }
-}
-
 /// A read file: header parsed and checked, checksum verified, data in place.
 ///
 /// Every tensor lies inside the file, has the bytes of its dtype and shape, and overlaps no other.
@@ -219,27 +202,27 @@ impl Container {
     /// [`ErrorKind::Io`] if it cannot be opened or is no regular file, else as [`Container::from_bytes`]; each names
     /// the file.
     pub fn open(path: &Path) -> Result<Self> {
-        // Asked before opening: opening a pipe would wait for a writer.
-        let found = fs::metadata(path).map_err(|e| Error::io(path, "open", &e))?;
-        if !found.is_file() {
-            return Err(Error::new(ErrorKind::Io, "cannot open: not a regular file").in_file(path));
-        }
-        let file = File::open(path).map_err(|e| Error::io(path, "open", &e))?;
-        if found.len() == 0 {
-            return Err(Error::format("the file is empty, expected safetensors").in_file(path));
-        }
-        // SAFETY: the map is read-only, and the doc comment passes on the one rule a type cannot hold: nobody shortens
-        // or rewrites the file while it is mapped. `write` never does; it renames a new file over the old name.
-        let map = unsafe { Mmap::map(&file) }.map_err(|e| Error::io(path, "map", &e))?;
-        Self::new(Backing::Mapped(map)).map_err(|e| e.in_file(path))
+        Self::new(Backing::map(path)?).map_err(|e| e.in_file(path))
+    }
+
+    /// Copies the file at `path` into memory and checks the copy: nothing that happens to the file later matters.
+    ///
+    /// # Errors
+    /// As [`Container::open`]; [`ErrorKind::TooLarge`] if the system has no memory for it.
+    pub fn read(path: &Path) -> Result<Self> {
+        Self::new(Backing::read(path)?).map_err(|e| e.in_file(path))
     }
 
     /// Checks bytes that are in memory already, such as a file built into the program.
     ///
+    /// They are used in place if they start on a multiple of 4, as a `Vec` does with the usual allocators, and copied
+    /// otherwise. Bytes that are built in start anywhere, unless they are a field of a `#[repr(align(64))]` type.
+    ///
     /// # Errors
-    /// [`ErrorKind::Format`] if the bytes are no safetensors or the checksum is wrong, missing or of an unknown kind.
+    /// [`ErrorKind::Format`] if the bytes are no safetensors or the checksum is wrong, missing or of an unknown kind;
+    /// [`ErrorKind::TooLarge`] if they must be copied and the system has no memory for it.
     pub fn from_bytes(bytes: impl Into<Cow<'static, [u8]>>) -> Result<Self> {
-        Self::new(Backing::Bytes(bytes.into()))
+        Self::new(Backing::from_bytes(bytes.into())?)
     }
 
     fn new(bytes: Backing) -> Result<Self> {
@@ -329,6 +312,7 @@ fn verify(bytes: &[u8], start: usize, metadata: &BTreeMap<String, String>) -> Re
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs;
 
     fn tensor<'a>(name: &str, dtype: Dtype, shape: &[usize], bytes: &'a [u8]) -> Tensor<'a> {
         Tensor { name: name.into(), dtype, shape: shape.into(), data: Data::Bytes(bytes) }

@@ -102,6 +102,7 @@ import(&checkpoint, &network, Options::default(), Path::new("model.safetensors")
 //! Without features the library reads models, rigs and `.safetensors` scenes, and runs them.
 
 mod arena;
+mod backing;
 pub mod camera;
 #[cfg(feature = "capi")]
 mod capi;

@@ -51,16 +51,29 @@ impl Model {
     /// # Errors
     /// [`ErrorKind::Io`] if it cannot be mapped; [`ErrorKind::Format`] and what is wrong otherwise.
     pub fn open(path: &Path) -> Result<Self> {
-        let container = Container::open(path)?;
+        Self::of_file(Container::open(path)?, path)
+    }
+
+    /// Copies a model file into memory and checks the copy as [`Model::open`] does. What was checked is what runs,
+    /// whatever happens to the file; the weights are not shared with other processes.
+    ///
+    /// # Errors
+    /// As [`Model::open`]; [`ErrorKind::TooLarge`] if the system has no memory for it.
+    pub fn read(path: &Path) -> Result<Self> {
+        Self::of_file(Container::read(path)?, path)
+    }
+
+    fn of_file(container: Container, path: &Path) -> Result<Self> {
         let mut model = Self::new(container).map_err(|e| e.in_file(path))?;
         model.path = Some(path.to_owned());
         Ok(model)
     }
 
-    /// A model from bytes in memory, such as one built into a program.
+    /// A model from bytes in memory, such as one built into a program. They are copied if they do not start on a multiple
+    /// of 4 ([`Container::from_bytes`]).
     ///
     /// # Errors
-    /// As [`Model::open`].
+    /// As [`Model::read`].
     pub fn from_bytes(bytes: impl Into<std::borrow::Cow<'static, [u8]>>) -> Result<Self> {
         Self::new(Container::from_bytes(bytes)?)
     }

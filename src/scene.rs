@@ -289,9 +289,8 @@ fn read_image(path: &Path, camera: &Camera) -> Result<Image> {
     let (width, height) = decoder.dimensions();
     let (width, height) = (width as usize, height as usize);
     check_side(name, height, width).map_err(|e| e.in_file(path))?;
-    let given = [camera.height, camera.width];
-    if given.iter().zip([height, width]).any(|(&given, found)| given != 0 && given != found) {
-        let [h, w] = given;
+    let [h, w] = [camera.height, camera.width];
+    if [h, w] != [height, width] {
         let message =
             format!("camera {name}: image of {height}x{width}, the calibration expects {h}x{w} (height x width)");
         return Err(Error::mismatch(message).in_file(path));

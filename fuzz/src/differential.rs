@@ -186,9 +186,15 @@ pub fn every_isa(before: &[f32], kernel: impl Fn(Isa, &mut [f32])) {
     };
     let want = run(Isa::Scalar);
     for isa in Isa::available().filter(|isa| *isa != Isa::Scalar) {
-        for (i, (got, want)) in run(isa).iter().zip(&want).enumerate() {
-            let same = got.to_bits() == want.to_bits() || (got.is_nan() && want.is_nan());
-            assert!(same, "{}: number {i} is {got:e}, not {want:e}", isa.name());
-        }
+        same(&run(isa), &want, isa.name());
+    }
+}
+
+/// Asserts equal bits, but for the payload of NaN.
+pub fn same(got: &[f32], want: &[f32], what: &str) {
+    assert_eq!(got.len(), want.len(), "{what}: lengths");
+    for (i, (got, want)) in got.iter().zip(want).enumerate() {
+        let same = got.to_bits() == want.to_bits() || (got.is_nan() && want.is_nan());
+        assert!(same, "{what}: number {i} is {got:e}, not {want:e}");
     }
 }

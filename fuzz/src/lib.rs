@@ -2,6 +2,7 @@
 
 pub mod differential;
 
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 use voxcast::import::import;
 use voxcast::model::Options;
@@ -31,9 +32,16 @@ pub fn network() -> Network {
     }
 }
 
+/// A path that this process alone writes to; in memory where the system has such a place, for files are made again and again.
+pub fn scratch_file(name: &str) -> PathBuf {
+    let memory = Path::new("/dev/shm");
+    let directory = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };
+    directory.join(format!("voxcast-fuzz-{}-{name}", std::process::id()))
+}
+
 /// A model file of [`network()`].
 pub fn model_bytes(options: Options) -> Vec<u8> {
-    let path = std::env::temp_dir().join(format!("voxcast-fuzz-{}", std::process::id()));
+    let path = scratch_file("model");
     import(&SeededWeights { seed: 1 }, &network(), options, &path, &mut |_, _| ()).expect("a model");
     let bytes = std::fs::read(&path).expect("what was just written");
     std::fs::remove_file(&path).expect("what was just read");

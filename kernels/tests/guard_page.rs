@@ -12,9 +12,10 @@ use voxcast_kernels::deconv3d::{Deconv3d, deconv3d};
 use voxcast_kernels::deform_conv2d::{DeformConv2d, deform_conv2d};
 use voxcast_kernels::depthwise::{Depthwise, depthwise};
 use voxcast_kernels::gate::{Gate, gate};
-use voxcast_kernels::gather::{Gather, gather};
+use voxcast_kernels::gather::{Gather, Mask, gather};
 use voxcast_kernels::head::{Head, head, scratch_len};
 use voxcast_kernels::max_pool::{MaxPool, max_pool};
+use voxcast_kernels::normalise::normalise;
 use voxcast_kernels::panels::packed_len;
 use voxcast_kernels::pool::{Mean, mean};
 use voxcast_kernels::product::{Product, Residual, SCRATCH};
@@ -31,8 +32,9 @@ enum Side {
     Back,
 }
 
-/// Plain numbers, for which any bits are a value.
+/// Plain values without padding, which can be copied byte by byte.
 trait Number: Copy {}
+impl Number for bool {}
 impl Number for u8 {}
 impl Number for u32 {}
 impl Number for f16 {}
@@ -244,17 +246,20 @@ fn deconv() {
 
 #[test]
 fn gathered_rows() {
-    for (channels, first_channel, stride) in [(5, 0, 5), (64, 0, 64), (27, 3, 30), (145, 0, 145), (16, 16, 32)] {
+    let widths = [(5, 0, 5), (64, 0, 64), (27, 3, 30), (145, 0, 145), (16, 16, 32)];
+    for ((channels, first_channel, stride), leave_out) in widths.into_iter().flat_map(|w| [(w, false), (w, true)]) {
         everywhere(|isa, side| {
             let ptr = Guarded::new(side, &[0, 3, 3, 5, 9]);
-            let col = Guarded::new(side, &[0, 1, 6, 6, 6, 5, 0, 6, 2]);
+            let col = Guarded::new(side, &[0, 1, 6, 6, 6, 0, 2, 5, 6]);
+            let masked = Guarded::new(side, &[false, true, false, false]);
+            let mask = leave_out.then_some(Mask { pixels: 2, masked: &masked });
             let features = Guarded::new(side, &numbers(7 * stride));
             let bias = Guarded::new(side, &numbers(channels));
             let mut out = Guarded::filled(side, 4 * channels, 0.0);
             let args = Gather {
                 ptr: &ptr,
                 col: &col,
-                mask: None,
+                mask,
                 features: &features,
                 stride,
                 first_channel,
@@ -271,24 +276,29 @@ fn gathered_rows() {
 #[test]
 fn head_of_whole_and_broken_blocks() {
     for (voxels, channels, classes) in [(97, 17, 5), (96, 16, 16), (7, 33, 17)] {
-        everywhere(|isa, side| {
-            let input = Guarded::new(side, &numbers(voxels * channels));
-            let columns = [channels, channels, classes];
-            let weights = columns.map(|columns| Guarded::new(side, &numbers(packed_len(channels, columns))));
-            let biases = columns.map(|columns| Guarded::new(side, &numbers(columns.next_multiple_of(16))));
-            let mut chosen = Guarded::filled(side, voxels, 255u8);
-            let mut logits = Guarded::filled(side, voxels * classes, 0.0f32);
-            let mut scratch = Guarded::filled(side, scratch_len(channels, classes), 0.0);
-            let args = Head {
-                input: &input,
-                channels,
-                classes,
-                weights: weights.each_ref().map(|w| Panels::F32(w)),
-                biases: biases.each_ref().map(|b| &b[..]),
-            };
-            head(isa, &args, 0..voxels, &mut chosen, Some(&mut logits), &mut scratch);
-            chosen.iter().map(|class| f32::from(*class)).chain(logits.iter().copied()).collect()
-        });
+        for (narrow, keep_logits) in [(false, true), (true, false)] {
+            everywhere(|isa, side| {
+                let input = Guarded::new(side, &numbers(voxels * channels));
+                let columns = [channels, channels, classes];
+                let single = columns.map(|columns| Guarded::new(side, &numbers(packed_len(channels, columns))));
+                let half = columns.map(|columns| Guarded::new(side, &halves(packed_len(channels, columns))));
+                let biases = columns.map(|columns| Guarded::new(side, &numbers(columns.next_multiple_of(16))));
+                let mut chosen = Guarded::filled(side, voxels, 255u8);
+                let mut logits = Guarded::filled(side, voxels * classes, 0.0f32);
+                let mut scratch = Guarded::filled(side, scratch_len(channels, classes), 0.0);
+                let panels = |i: usize| if narrow { Panels::F16(&half[i]) } else { Panels::F32(&single[i]) };
+                let args = Head {
+                    input: &input,
+                    channels,
+                    classes,
+                    weights: [0, 1, 2].map(panels),
+                    biases: biases.each_ref().map(|b| &b[..]),
+                };
+                let kept = keep_logits.then_some(&mut logits[..]);
+                head(isa, &args, 0..voxels, &mut chosen, kept, &mut scratch);
+                chosen.iter().map(|class| f32::from(*class)).chain(logits.iter().copied()).collect()
+            });
+        }
     }
 }
 
@@ -392,6 +402,37 @@ fn attention() {
             });
         }
     }
+}
+
+#[test]
+fn normalised_rows() {
+    for (height, width, padded_width, rows) in [(3, 5, 5, 3), (2, 11, 16, 4), (1, 1, 1, 1)] {
+        everywhere(|_, side| {
+            let image: Vec<u8> = (0..height * width * 3).map(|i| i as u8).collect();
+            let image = Guarded::new(side, &image);
+            let mut out = Guarded::filled(side, rows * padded_width * 3, 0.0f32);
+            normalise(&image, height, width, padded_width, 0, &mut out);
+            out.to_vec()
+        });
+    }
+}
+
+/// Rows from the middle: what lies before and after them is not there.
+#[test]
+fn some_rows_of_many() {
+    let geometry = walk([1, 7, 14], 17, [1, 3, 3], 1, [0, 1, 1]);
+    let (depth, columns, rows) = (geometry.depth(), 21, 13..52);
+    everywhere(|isa, side| {
+        let input = Guarded::new(side, &numbers(7 * 14 * 17));
+        let weights = Guarded::new(side, &numbers(packed_len(depth, columns)));
+        let bias = Guarded::new(side, &numbers(32));
+        let mut out = Guarded::filled(side, rows.len() * columns, 0.0);
+        let mut scratch = Guarded::filled(side, SCRATCH, 0.0);
+        let (weights, residual) = (Panels::F32(&weights), Residual::None);
+        let product = Product { weights, bias: &bias, depth, columns, relu: false, residual };
+        conv(isa, &Conv { geometry, input: &input, product }, rows.clone(), columns, &mut out, &mut scratch);
+        out.to_vec()
+    });
 }
 
 #[test]

@@ -4,6 +4,7 @@ use super::*;
 use crate::container;
 use crate::import::import;
 use crate::seeded::SeededWeights;
+use std::sync::OnceLock;
 
 fn network() -> Network {
     Network {
@@ -54,6 +55,33 @@ fn refused(edit: impl FnOnce(&mut Vec<Loose>, &mut BTreeMap<String, String>), ex
     let error = Model::from_bytes(edited(edit)).expect_err(expected);
     assert_eq!(error.kind(), ErrorKind::Format, "{error}");
     assert!(error.message().contains(expected), "{error} (expected {expected})");
+}
+
+#[test]
+fn bytes_may_start_anywhere() {
+    // In a static, as bytes that are built in.
+    static SHIFTED: OnceLock<[Vec<u8>; 4]> = OnceLock::new();
+    let file = sound(Options::default());
+    let shifted = SHIFTED.get_or_init(|| [0, 1, 2, 3].map(|start| [&vec![0; start][..], &file].concat()));
+    for (start, bytes) in shifted.iter().enumerate() {
+        let model = Model::from_bytes(&bytes[start..]).unwrap_or_else(|e| panic!("from byte {start}: {e}"));
+        assert_eq!(model.container.bytes(), file);
+    }
+}
+
+#[test]
+fn a_model_that_was_read_needs_no_file() {
+    let directory = tempfile::tempdir().expect("a place");
+    let path = directory.path().join("model");
+    let file = sound(Options::default());
+    std::fs::write(&path, &file).expect("room");
+    let model = Model::read(&path).expect("sound");
+    let cut = std::fs::OpenOptions::new().write(true).open(&path).and_then(|f| f.set_len(100));
+    cut.expect("a file of our own");
+    assert_eq!((model.container.bytes(), model.path()), (&file[..], Some(&*path)));
+    for error in [Model::read(&path), Model::open(&path)].map(|again| again.expect_err("a cut file")) {
+        assert_eq!((error.kind(), error.path()), (ErrorKind::Format, Some(&*path)));
+    }
 }
 
 #[test]

@@ -31,6 +31,15 @@ impl Rig {
         Container::open(path).and_then(|c| Rig::from_container(c, network, cameras)).map_err(|e| e.in_file(path))
     }
 
+    /// Copies the rig at `path` into memory and checks the copy as [`Rig::open`] does: nothing that happens to the file
+    /// later matters.
+    ///
+    /// # Errors
+    /// As [`Rig::open`]; [`ErrorKind::TooLarge`] if the system has no memory for it.
+    pub fn read(path: &Path, network: &Network, cameras: usize) -> Result<Rig> {
+        Container::read(path).and_then(|c| Rig::from_container(c, network, cameras)).map_err(|e| e.in_file(path))
+    }
+
     /// [`Rig::open`] of a container that is open already.
     ///
     /// # Errors

@@ -6,6 +6,7 @@
 mod pth;
 
 use pth::{Entry, Tensor, Wrap};
+use std::io::Read;
 use std::path::Path;
 use voxcast::graph::Rewrites;
 use voxcast::model::Options;
@@ -20,10 +21,11 @@ fn main() -> std::io::Result<()> {
         ("checkpoint", checkpoints()),
         ("image", images()),
         ("model", models()),
+        ("npz", archives()),
         ("rig", rigs()),
         ("scene", scenes()),
     ];
-    all.extend(KERNELS.map(|target| (target, drawn())));
+    all.extend(DRAWN.map(|target| (target, drawn())));
     for (target, seeds) in all {
         let dir = corpus.join(target);
         std::fs::create_dir_all(&dir)?;
@@ -36,7 +38,7 @@ fn main() -> std::io::Result<()> {
 }
 
 /// Targets whose inputs are shapes and numbers, which drawn bytes make as well as any others.
-const KERNELS: [&str; 14] = [
+const DRAWN: [&str; 15] = [
     "conv",
     "deconv3d",
     "deform_conv2d",
@@ -49,6 +51,7 @@ const KERNELS: [&str; 14] = [
     "normalise",
     "project",
     "scale_shift",
+    "session",
     "upsample_add",
     "window_attention",
 ];
@@ -119,9 +122,34 @@ fn models() -> Vec<(String, Vec<u8>)> {
     seeds
 }
 
+/// A whole archive, and its entries behind a byte that chooses how they are stored.
+fn archives() -> Vec<(String, Vec<u8>)> {
+    use voxcast::npz::{Array, Elements, write_npz};
+    let path = voxcast_fuzz::scratch_file("seed");
+    let array = |name, shape, elements| Array { name, shape, elements };
+    let arrays = [
+        array("classes", &[2, 3], Elements::U8(&[1; 6])),
+        array("support", &[2], Elements::U16(&[1, 258])),
+        array("logits", &[1, 1, 2], Elements::F32(&[0.5, -0.0])),
+        array("time", &[], Elements::F32(&[1.0])),
+    ];
+    write_npz(&path, &arrays).expect("room for a small file");
+    let file = std::fs::read(&path).expect("what was just written");
+    std::fs::remove_file(&path).expect("what was just read");
+    let mut seeds = vec![];
+    let mut zip = zip::ZipArchive::new(std::io::Cursor::new(&file)).expect("what was just written");
+    for (i, array) in arrays.iter().enumerate() {
+        let mut bytes = vec![i as u8];
+        zip.by_index(i).expect("an entry").read_to_end(&mut bytes).expect("memory");
+        seeds.push((array.name.to_owned(), bytes));
+    }
+    seeds.push(("whole".into(), file));
+    seeds
+}
+
 /// Edits, and a whole rig.
 fn rigs() -> Vec<(String, Vec<u8>)> {
-    let path = std::env::temp_dir().join(format!("voxcast-fuzz-rig-{}", std::process::id()));
+    let path = voxcast_fuzz::scratch_file("rig");
     let network = voxcast_fuzz::network();
     let camera = [20., 0., 8., 30., 0., 20., 0., 15., 0.1, 0., 0.5, 1., 0., 0., 0., 1.];
     let rig = RigBuilder::new(&network, 2, voxcast::Isa::best())
