@@ -147,6 +147,11 @@ impl Case {
         (0..len).map(|_| (random.below(127) as f32 - 63.0) / 256.0).collect()
     }
 
+    /// Weights of sums over `fan` inputs that keep the size of numbers.
+    pub(crate) fn scaled(&self, what: &str, len: usize, fan: usize) -> Vec<f32> {
+        self.numbers(what, len).into_iter().map(|v| v / (fan as f32).sqrt()).collect()
+    }
+
     /// Numbers around one, above zero: variances and factors.
     pub(crate) fn positive(&self, what: &str, len: usize) -> Vec<f32> {
         let mut random = self.random(what);

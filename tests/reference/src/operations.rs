@@ -115,7 +115,7 @@ fn attention(gpu: &Gpu, case: &Case, plane: [usize; 2], heads: usize, part: usiz
     let channels = heads * part;
     let side = plane[0].min(7);
     let pair = |name: String, len: usize, outputs: usize| {
-        (gpu.upload(&case.numbers(&name, len)), norm(gpu, case, &format!("{name}."), outputs))
+        (gpu.upload(&case.scaled(&name, len, len / outputs)), norm(gpu, case, &format!("{name}."), outputs))
     };
     let weights: Vec<HeadWeights> = (0..heads)
         .map(|i| HeadWeights {
