@@ -86,7 +86,7 @@ impl Case {
         let from = directory.join(&name);
         let weights: Box<dyn Source> = match entry["checkpoint"].as_str() {
             Some(file) => Box::new(Checkpoint::open(from.join(file)).unwrap()),
-            None => Box::new(weights::Weights(entry["seed"].as_u64().unwrap())),
+            None => Box::new(weights::Tempered(entry["seed"].as_u64().unwrap())),
         };
         let network = Network::from_json(&std::fs::read_to_string(from.join("network.json")).unwrap()).unwrap();
         let scene = Scene::open(&from.join("scene.safetensors")).unwrap();

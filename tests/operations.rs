@@ -183,9 +183,8 @@ impl Run<'_> {
         let Kind::Conv(shape) = self.case.kind else { unreachable!() };
         let table::Conv { extent, inputs, outputs, kernel, after, .. } = shape;
         let (stride, dilation, padding) = shape.axes();
-        let output = std::array::from_fn(|a| {
-            (extent[a] + 2 * padding[a] - dilation[a] * (kernel[a] - 1) - 1) / stride[a] + 1
-        });
+        let output =
+            std::array::from_fn(|a| (extent[a] + 2 * padding[a] - dilation[a] * (kernel[a] - 1) - 1) / stride[a] + 1);
         let geometry = Geometry { input: extent, channels: inputs, kernel, stride, dilation, padding, output };
         let positions = geometry.rows();
         let weight = self.case.weights("weight", outputs * geometry.depth());
@@ -285,9 +284,8 @@ impl Run<'_> {
             }
             (weight, padded(&shift))
         };
-        let dense = |weight: &[f32], inputs: usize, outputs: usize| {
-            packed(inputs, outputs, |k, n| weight[n * inputs + k])
-        };
+        let dense =
+            |weight: &[f32], inputs: usize, outputs: usize| packed(inputs, outputs, |k, n| weight[n * inputs + k]);
         let [mut qkv, mut qkv_bias, mut query, mut query_bias, mut offsets] = [const { Vec::<f32>::new() }; 5];
         for i in 0..heads {
             let (weight, bias) = folded(format!("qkv.{i}"), 3 * part * part, 3 * part);
@@ -400,14 +398,15 @@ fn kernels_agree_with_the_reference() {
     let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/reference");
     let manifest = std::fs::read_to_string(directory.join("manifest.json")).unwrap();
     let manifest: serde_json::Value = serde_json::from_str(&manifest).unwrap();
-    let most = manifest["tolerance"]["operation"]["max"].as_f64().unwrap();
+    let tolerance = |kind: &str| manifest["tolerance"][kind]["max"].as_f64().unwrap();
     let bytes = std::fs::read(directory.join("operations.safetensors")).unwrap();
     let file = SafeTensors::deserialize(&bytes).unwrap();
-    let mut report = format!("largest difference over the rms, at most {most:e}\n");
+    let mut report = "largest difference over the rms, and at most\n".to_owned();
     let mut good = true;
     for case in &table() {
         let tensor = file.tensor(case.name).unwrap();
         let expected: Vec<f32> = tensor.data().as_chunks().0.iter().map(|&b| f32::from_le_bytes(b)).collect();
+        let most = tolerance(if matches!(case.kind, Kind::WindowAttention { .. }) { "attention" } else { "operation" });
         for isa in Isa::available() {
             for half in [false, true] {
                 let found = Run { case, isa, half }.result();
@@ -415,12 +414,11 @@ fn kernels_agree_with_the_reference() {
                 let off = apart(&found, &expected);
                 let mark = if off <= most { "" } else { "  <- too far" };
                 good &= off <= most;
-                writeln!(report, "{:24} {:8} {} {off:9.2e}{mark}", case.name, isa.name(), if half { "f16" } else { "f32" })
-                    .unwrap();
+                let precision = if half { "f16" } else { "f32" };
+                writeln!(report, "{:24} {:8} {precision} {off:9.2e} {most:7.0e}{mark}", case.name, isa.name()).unwrap();
             }
         }
     }
-    println!("{report}");
     assert!(good, "{report}");
     let names: BTreeSet<String> = table().iter().map(|c| c.name.to_owned()).collect();
     assert_eq!(names.len(), table().len(), "names are unique");

@@ -25,22 +25,76 @@ pub(crate) enum After {
 
 #[derive(Clone, Debug)]
 pub(crate) enum Kind {
-    Normalise { height: usize, width: usize },
+    Normalise {
+        height: usize,
+        width: usize,
+    },
     Conv(Conv),
     /// Offsets of up to `reach` pixels.
-    DeformConv { height: usize, width: usize, inputs: usize, outputs: usize, reach: f32 },
-    Depthwise { height: usize, width: usize, channels: usize, side: usize },
-    BatchNorm { positions: usize, channels: usize, after: After },
-    MaxPool { height: usize, width: usize, channels: usize },
-    UpsampleAdd { low: [usize; 2], size: [usize; 2], channels: usize },
+    DeformConv {
+        height: usize,
+        width: usize,
+        inputs: usize,
+        outputs: usize,
+        reach: f32,
+    },
+    Depthwise {
+        height: usize,
+        width: usize,
+        channels: usize,
+        side: usize,
+    },
+    BatchNorm {
+        positions: usize,
+        channels: usize,
+        after: After,
+    },
+    MaxPool {
+        height: usize,
+        width: usize,
+        channels: usize,
+    },
+    UpsampleAdd {
+        low: [usize; 2],
+        size: [usize; 2],
+        channels: usize,
+    },
     /// Rows of the given lengths.
-    Gather { rows: &'static [usize], cameras: usize, pixels: usize, channels: usize },
-    Deconv { extent: [usize; 3], inputs: usize, outputs: usize, after: After },
-    WindowAttention { plane: [usize; 2], heads: usize, part: usize },
-    Gate { columns: [usize; 2], depth: usize, channels: usize },
-    GlobalMean { positions: usize, channels: usize },
-    Broadcast { positions: usize, channels: usize },
-    Head { voxels: usize, channels: usize, classes: usize },
+    Gather {
+        rows: &'static [usize],
+        cameras: usize,
+        pixels: usize,
+        channels: usize,
+    },
+    Deconv {
+        extent: [usize; 3],
+        inputs: usize,
+        outputs: usize,
+        after: After,
+    },
+    WindowAttention {
+        plane: [usize; 2],
+        heads: usize,
+        part: usize,
+    },
+    Gate {
+        columns: [usize; 2],
+        depth: usize,
+        channels: usize,
+    },
+    GlobalMean {
+        positions: usize,
+        channels: usize,
+    },
+    Broadcast {
+        positions: usize,
+        channels: usize,
+    },
+    Head {
+        voxels: usize,
+        channels: usize,
+        classes: usize,
+    },
 }
 
 /// A convolution. `padding` keeps the size at stride 1.
@@ -108,10 +162,7 @@ pub(crate) fn table() -> Vec<Case> {
         ("max_pool.one", Kind::MaxPool { height: 1, width: 1, channels: 3 }),
         ("upsample_add.double", Kind::UpsampleAdd { low: [3, 5], size: [6, 10], channels: 18 }),
         ("upsample_add.odd", Kind::UpsampleAdd { low: [3, 4], size: [5, 7], channels: 7 }),
-        (
-            "gather.rows",
-            Kind::Gather { rows: &[0, 1, 27, 0, 3, 64, 2, 1, 5, 0], cameras: 3, pixels: 40, channels: 70 },
-        ),
+        ("gather.rows", Kind::Gather { rows: &[0, 1, 27, 0, 3, 64, 2, 1, 5, 0], cameras: 3, pixels: 40, channels: 70 }),
         ("gather.empty", Kind::Gather { rows: &[0; 5], cameras: 1, pixels: 6, channels: 9 }),
         ("deconv.cube", Kind::Deconv { extent: [3, 4, 2], inputs: 7, outputs: 18, after: After::Nothing }),
         ("deconv.flat", Kind::Deconv { extent: [2, 5, 1], inputs: 16, outputs: 9, after: After::ReluAdd }),

@@ -57,7 +57,8 @@ impl Case {
     pub fn open(directory: &Path) -> Result<Self, Failure> {
         let path = ["checkpoint.safetensors", "checkpoint.pth"].map(|name| directory.join(name));
         let path = path.iter().find(|path| path.is_file());
-        let path = path.ok_or_else(|| Failure(format!("{}: no checkpoint.safetensors or .pth", directory.display())))?;
+        let path =
+            path.ok_or_else(|| Failure(format!("{}: no checkpoint.safetensors or .pth", directory.display())))?;
         Self::read(directory, Box::new(Checkpoint::open(path)?))
     }
 
@@ -86,7 +87,7 @@ impl Case {
             let network = read_network(directory)?;
             write_scene(&path, &cropped(demo_scene(&network, seed)))?;
         }
-        Self::read(directory, Box::new(weights::Weights(seed)))
+        Self::read(directory, Box::new(weights::Tempered(seed)))
     }
 
     fn read(directory: &Path, weights: Box<dyn Source>) -> Result<Self, Failure> {

@@ -127,7 +127,7 @@ impl Gpu {
 
     fn check(&self, len: usize) -> usize {
         let most = self.device.limits().max_storage_buffer_binding_size / 4;
-        assert!(len > 0 && len as u64 <= u64::from(most), "a buffer of {len} numbers, expected 1 to {most}");
+        assert!(len > 0 && len as u64 <= most, "a buffer of {len} numbers, expected 1 to {most}");
         len
     }
 

@@ -203,11 +203,8 @@ impl Run<'_> {
     fn attention(&self, prefix: &str, x: &Tensor, heads: usize, dim: usize) -> Result<Tensor, Failure> {
         let side = WINDOW.min(x.extent[1]);
         let offsets = format!("{prefix}.attention_biases");
-        let offsets = Tensor {
-            extent: [1, side, side],
-            channels: heads,
-            buffer: self.load(&offsets, &[heads, side * side])?,
-        };
+        let offsets =
+            Tensor { extent: [1, side, side], channels: heads, buffer: self.load(&offsets, &[heads, side * side])? };
         let part = x.channels / heads;
         let pair = |name: &str, shape: &[usize]| -> Result<(Buffer, Norm), Failure> {
             let weight = self.load(&format!("{prefix}.{name}.c.weight"), shape)?;
