@@ -84,39 +84,8 @@ impl Run<'_> {
             }
             Kind::Conv(_) => self.conv(),
             Kind::DeformConv { .. } => self.deform_conv(),
-            Kind::Depthwise { height, width, channels, side } => {
-                let weight = case.weights("weight", channels * side * side);
-                let args = Depthwise {
-                    input: &self.rows("x", height * width, channels),
-                    height,
-                    width,
-                    channels,
-                    kernel: side,
-                    weights: &taps(&weight, channels),
-                    bias: &padded(&vec![0.0; channels]),
-                    residual: true,
-                };
-                let mut out = vec![f32::NAN; height * width * channels];
-                depthwise(self.isa, &args, 0..height, &mut out);
-                channels_first(&out, channels)
-            }
-            Kind::BatchNorm { positions, channels, after } => {
-                let (scale, shift) = norm(case, "", channels);
-                let residual = self.rows("residual", positions, channels);
-                let args = ScaleShift {
-                    scale: &padded(&scale),
-                    shift: &padded(&shift),
-                    channels,
-                    first_channel: 0,
-                    stride: channels,
-                    residual: adds(after).then_some(&residual),
-                    residual_after: after == After::ReluAdd,
-                    relu: after != After::Nothing,
-                };
-                let mut out = self.rows("x", positions, channels);
-                scale_shift(self.isa, &args, &mut out);
-                channels_first(&out, channels)
-            }
+            Kind::Depthwise { height, width, channels, side } => self.depthwise([height, width], channels, side),
+            Kind::BatchNorm { positions, channels, after } => self.batch_norm(positions, channels, after),
             Kind::MaxPool { height, width, channels } => {
                 let input = self.rows("x", height * width, channels);
                 let args = MaxPool { input: &input, height, width, channels, kernel: 3, stride: 2, padding: 1 };
@@ -132,25 +101,7 @@ impl Run<'_> {
                 upsample_add(self.isa, &args, 0..height, &mut out);
                 channels_first(&out, channels)
             }
-            Kind::Gather { rows, cameras, pixels, channels } => {
-                let (ptr, col) = case.matrix(rows, cameras * pixels);
-                let features: Vec<f32> =
-                    (0..cameras).flat_map(|i| self.rows(&format!("camera {i}"), pixels, channels)).collect();
-                let args = Gather {
-                    ptr: &ptr,
-                    col: &col,
-                    mask: None,
-                    features: &features,
-                    stride: channels,
-                    first_channel: 0,
-                    channels,
-                    bias: None,
-                    relu: false,
-                };
-                let mut out = vec![f32::NAN; rows.len() * channels];
-                gather(self.isa, &args, 0..rows.len(), &mut out);
-                channels_first(&out, channels)
-            }
+            Kind::Gather { rows, cameras, pixels, channels } => self.gather(rows, cameras, pixels, channels),
             Kind::Deconv { .. } => self.deconv(),
             Kind::WindowAttention { plane, heads, part } => self.attention(plane, heads, part),
             Kind::Gate { columns: [x, y], depth, channels } => {
@@ -177,6 +128,64 @@ impl Run<'_> {
             }
             Kind::Head { voxels, channels, classes } => self.head(voxels, channels, classes),
         }
+    }
+
+    fn depthwise(&self, [height, width]: [usize; 2], channels: usize, side: usize) -> Vec<f32> {
+        let case = self.case;
+        let weight = case.weights("weight", channels * side * side);
+        let args = Depthwise {
+            input: &self.rows("x", height * width, channels),
+            height,
+            width,
+            channels,
+            kernel: side,
+            weights: &taps(&weight, channels),
+            bias: &padded(&vec![0.0; channels]),
+            residual: true,
+        };
+        let mut out = vec![f32::NAN; height * width * channels];
+        depthwise(self.isa, &args, 0..height, &mut out);
+        channels_first(&out, channels)
+    }
+
+    fn batch_norm(&self, positions: usize, channels: usize, after: After) -> Vec<f32> {
+        let case = self.case;
+        let (scale, shift) = norm(case, "", channels);
+        let residual = self.rows("residual", positions, channels);
+        let args = ScaleShift {
+            scale: &padded(&scale),
+            shift: &padded(&shift),
+            channels,
+            first_channel: 0,
+            stride: channels,
+            residual: adds(after).then_some(&residual),
+            residual_after: after == After::ReluAdd,
+            relu: after != After::Nothing,
+        };
+        let mut out = self.rows("x", positions, channels);
+        scale_shift(self.isa, &args, &mut out);
+        channels_first(&out, channels)
+    }
+
+    fn gather(&self, rows: &[usize], cameras: usize, pixels: usize, channels: usize) -> Vec<f32> {
+        let case = self.case;
+        let (ptr, col) = case.matrix(rows, cameras * pixels);
+        let features: Vec<f32> =
+            (0..cameras).flat_map(|i| self.rows(&format!("camera {i}"), pixels, channels)).collect();
+        let args = Gather {
+            ptr: &ptr,
+            col: &col,
+            mask: None,
+            features: &features,
+            stride: channels,
+            first_channel: 0,
+            channels,
+            bias: None,
+            relu: false,
+        };
+        let mut out = vec![f32::NAN; rows.len() * channels];
+        gather(self.isa, &args, 0..rows.len(), &mut out);
+        channels_first(&out, channels)
     }
 
     fn conv(&self) -> Vec<f32> {

@@ -77,14 +77,7 @@ fn result(gpu: &Gpu, case: &Case) -> Vec<f32> {
         Kind::Broadcast { positions, channels } => {
             ops::broadcast(gpu, &tensor("x", [1; 3], channels), [1, 1, positions])
         }
-        Kind::Head { voxels, channels, classes } => {
-            let layer = |i: usize, outputs: usize| {
-                let weight = weights(&format!("{i}.weight"), outputs * channels);
-                [weight, weights(&format!("{i}.bias"), outputs)]
-            };
-            let layers = [layer(0, channels), layer(1, channels), layer(2, classes)];
-            return gpu.read(&ops::head(gpu, &tensor("x", [1, 1, voxels], channels), &layers).0);
-        }
+        Kind::Head { voxels, channels, classes } => return head(gpu, case, voxels, channels, classes),
     };
     gpu.read(&y.buffer)
 }
@@ -126,4 +119,14 @@ fn attention(gpu: &Gpu, case: &Case, plane: [usize; 2], heads: usize, part: usiz
         .collect();
     let x = Tensor::new(gpu, [1, plane[0], plane[1]], channels, &case.numbers("x", plane[0] * plane[1] * channels));
     ops::window_attention(gpu, &x, 7, &weights, &pair("proj".to_owned(), channels * channels, channels))
+}
+
+fn head(gpu: &Gpu, case: &Case, voxels: usize, channels: usize, classes: usize) -> Vec<f32> {
+    let layer = |i: usize, outputs: usize| {
+        let weight = gpu.upload(&case.weights(&format!("{i}.weight"), outputs * channels));
+        [weight, gpu.upload(&case.weights(&format!("{i}.bias"), outputs))]
+    };
+    let layers = [layer(0, channels), layer(1, channels), layer(2, classes)];
+    let x = Tensor::new(gpu, [1, 1, voxels], channels, &case.numbers("x", voxels * channels));
+    gpu.read(&ops::head(gpu, &x, &layers).0)
 }
