@@ -1,27 +1,33 @@
-//! Whole networks against golden cases: every stage, within the tolerance that `golden/manifest.json` states and explains.
+//! Whole networks against golden cases: every stage, within the tolerance that each `manifest.json` states and explains.
+//! Those in `golden` come from PyTorch, those in `golden/reference` from the reference (docs/reference.md).
 
 use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use voxcast::checkpoint::Checkpoint;
 use voxcast::container::{self, Data, Layout, Tensor};
 use voxcast::graph::{Graph, Op, Rewrites};
-use voxcast::import::import;
+use voxcast::import::{Source, import};
 use voxcast::model::Options;
 use voxcast::rig::RigBuilder;
 use voxcast::session::views;
 use voxcast::weights::Precision;
 use voxcast::{Isa, Model, Network, Rig, Scene, Session, SessionOptions, Threads};
 
-fn golden() -> PathBuf {
-    PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/golden")
+#[path = "support/weights.rs"]
+mod weights;
+
+/// Where golden cases lie, each with a manifest.
+fn golden() -> [PathBuf; 2] {
+    let golden = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
+    [golden.join("reference"), golden]
 }
 
-fn manifest() -> Value {
-    serde_json::from_str(&std::fs::read_to_string(golden().join("manifest.json")).unwrap()).unwrap()
+fn manifest(directory: &Path) -> Value {
+    serde_json::from_str(&std::fs::read_to_string(directory.join("manifest.json")).unwrap()).unwrap()
 }
 
 /// A golden case with everything but its expected stages read.
@@ -29,7 +35,9 @@ struct Case {
     name: String,
     network: Network,
     scene: Scene,
-    checkpoint: Checkpoint,
+    weights: Box<dyn Source>,
+    /// What its manifest says of tolerances.
+    tolerance: Value,
     expected: Vec<u8>,
     left_out: BTreeSet<String>,
     rig: Arc<Rig>,
@@ -61,23 +69,25 @@ struct Tolerance {
     classes: f64,
 }
 
-fn tolerance(precision: Precision) -> Tolerance {
-    let tolerance = &manifest()["tolerance"][precision.name()];
-    let get = |key: &str| tolerance[key].as_f64().unwrap();
-    Tolerance { max: get("max"), rms: get("rms"), classes: get("equal_classes") }
-}
-
 fn cases() -> Vec<Case> {
-    let manifest = manifest();
-    let cases: Vec<Case> = manifest["cases"].as_array().unwrap().iter().map(Case::read).collect();
-    assert!(cases.len() >= 2);
+    let mut cases = vec![];
+    for directory in golden() {
+        let manifest = manifest(&directory);
+        let entries = manifest["cases"].as_array().unwrap();
+        assert!(entries.len() >= 2);
+        cases.extend(entries.iter().map(|entry| Case::read(&directory, entry, &manifest["tolerance"])));
+    }
     cases
 }
 
 impl Case {
-    fn read(entry: &Value) -> Self {
+    fn read(directory: &Path, entry: &Value, tolerance: &Value) -> Self {
         let name = entry["name"].as_str().unwrap().to_owned();
-        let from = golden().join(&name);
+        let from = directory.join(&name);
+        let weights: Box<dyn Source> = match entry["checkpoint"].as_str() {
+            Some(file) => Box::new(Checkpoint::open(from.join(file)).unwrap()),
+            None => Box::new(weights::Tempered(entry["seed"].as_u64().unwrap())),
+        };
         let network = Network::from_json(&std::fs::read_to_string(from.join("network.json")).unwrap()).unwrap();
         let scene = Scene::open(&from.join("scene.safetensors")).unwrap();
         scene.check(&network).unwrap();
@@ -87,7 +97,8 @@ impl Case {
         write_rig(&SafeTensors::deserialize(&expected).unwrap(), &path);
         Case {
             rig: Arc::new(Rig::open(&path, &network, scene.cameras()).unwrap()),
-            checkpoint: Checkpoint::open(from.join(entry["checkpoint"].as_str().unwrap())).unwrap(),
+            weights,
+            tolerance: tolerance.clone(),
             left_out: entry["left_out"].as_array().unwrap().iter().map(|v| v.as_str().unwrap().to_owned()).collect(),
             name,
             network,
@@ -97,6 +108,12 @@ impl Case {
         }
     }
 
+    fn tolerance(&self, precision: Precision) -> Tolerance {
+        let tolerance = &self.tolerance[precision.name()];
+        let get = |key: &str| tolerance[key].as_f64().unwrap();
+        Tolerance { max: get("max"), rms: get("rms"), classes: get("equal_classes") }
+    }
+
     fn expected(&self) -> SafeTensors<'_> {
         SafeTensors::deserialize(&self.expected).unwrap()
     }
@@ -104,13 +121,14 @@ impl Case {
     fn model(&self, precision: Precision, rewrites: Rewrites) -> Arc<Model> {
         let path = self.directory.path().join("model");
         let options = Options { precision, rewrites };
-        import(&self.checkpoint, &self.network, options, &path, &mut |_, _| ()).unwrap();
+        import(&*self.weights, &self.network, options, &path, &mut |_, _| ()).unwrap();
         Arc::new(Model::open(&path).unwrap())
     }
 
     /// Runs every stage there is.
-    fn run(&self, model: Arc<Model>, unfolded: bool) -> Found {
+    fn run(&self, model: Arc<Model>, unfolded: bool, isa: Isa) -> Found {
         let options = SessionOptions {
+            isa,
             threads: Threads::new(2).unwrap(),
             unfolded,
             logits: true,
@@ -224,10 +242,10 @@ fn difference(stage: &Stage, expected: &[f32]) -> (f64, f64) {
 fn unfolded_stages_agree() {
     for case in cases() {
         let model = case.model(Precision::F32, Rewrites::ALL);
-        let found = case.run(model.clone(), true);
+        let found = case.run(model.clone(), true, Isa::best());
         let graph = model.graph(true, true);
         assert!(graph.stages().any(|s| s == "level1.gather.volume"));
-        case.compare("projection kept", &graph, &found, tolerance(Precision::F32));
+        case.compare("projection kept", &graph, &found, case.tolerance(Precision::F32));
     }
 }
 
@@ -235,10 +253,10 @@ fn unfolded_stages_agree() {
 fn folded_stages_agree() {
     for case in cases() {
         let model = case.model(Precision::F32, Rewrites::ALL);
-        let found = case.run(model.clone(), false);
+        let found = case.run(model.clone(), false, Isa::best());
         let graph = model.graph(false, true);
         assert!(!graph.stages().any(|s| s == "level1.gather.volume") && graph.stages().any(|s| s == "level1.volume"));
-        case.compare("projection folded", &graph, &found, tolerance(Precision::F32));
+        case.compare("projection folded", &graph, &found, case.tolerance(Precision::F32));
     }
 }
 
@@ -246,8 +264,8 @@ fn folded_stages_agree() {
 fn stages_without_any_rewrite_agree() {
     for case in cases() {
         let model = case.model(Precision::F32, Rewrites::NONE);
-        let found = case.run(model.clone(), false);
-        case.compare("no rewrites", &model.graph(false, true), &found, tolerance(Precision::F32));
+        let found = case.run(model.clone(), false, Isa::best());
+        case.compare("no rewrites", &model.graph(false, true), &found, case.tolerance(Precision::F32));
     }
 }
 
@@ -256,8 +274,21 @@ fn half_precision_agrees() {
     for case in cases() {
         let model = case.model(Precision::F16, Rewrites::ALL);
         for unfolded in [false, true] {
-            let found = case.run(model.clone(), unfolded);
-            case.compare("half precision", &model.graph(unfolded, true), &found, tolerance(Precision::F16));
+            let found = case.run(model.clone(), unfolded, Isa::best());
+            case.compare("half precision", &model.graph(unfolded, true), &found, case.tolerance(Precision::F16));
+        }
+    }
+}
+
+#[test]
+fn every_instruction_set_agrees() {
+    for case in cases() {
+        for precision in [Precision::F32, Precision::F16] {
+            let model = case.model(precision, Rewrites::ALL);
+            for isa in Isa::available() {
+                let found = case.run(model.clone(), false, isa);
+                case.compare(isa.name(), &model.graph(false, true), &found, case.tolerance(precision));
+            }
         }
     }
 }

@@ -2,14 +2,17 @@
 
 use std::sync::Arc;
 use voxcast::graph::Rewrites;
-use voxcast::import::{Source, import};
+use voxcast::import::import;
 use voxcast::model::Options;
 use voxcast::network::{Block, Sampling};
 use voxcast::random::Random;
 use voxcast::rig::RigBuilder;
-use voxcast::seeded::SeededWeights;
 use voxcast::weights::Precision;
-use voxcast::{ImageView, Isa, Model, Network, Result, Rig};
+use voxcast::{ImageView, Isa, Model, Network, Rig};
+
+#[path = "weights.rs"]
+mod weights;
+pub(crate) use weights::Weights;
 
 /// A network with odd sizes wherever sizes are free: channels that fill no vector, X != Y, windows that need padding.
 pub(crate) fn network() -> Network {
@@ -29,23 +32,6 @@ pub(crate) fn network() -> Network {
         samples: [3, 2, 2],
         sampling: Sampling::Linspace,
         cameras: 2,
-    }
-}
-
-/// Drawn weights whose batch norms do something, unlike those of [`SeededWeights`].
-pub(crate) struct Weights(pub(crate) u64);
-
-impl Source for Weights {
-    fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>> {
-        let mut values = SeededWeights { seed: self.0 }.tensor(name, shape)?;
-        let seed = name.bytes().fold(self.0, |h, b| h.wrapping_mul(0x0100_0000_01b3) ^ u64::from(b));
-        let mut random = Random::new(seed);
-        if name.ends_with("running_mean") {
-            values.iter_mut().for_each(|v| *v = f64::from(random.normal()) * 0.1);
-        } else if name.ends_with("running_var") || (shape.len() == 1 && name.ends_with(".weight")) {
-            values.iter_mut().for_each(|v| *v = f64::from(random.range(0.5, 1.5)));
-        }
-        Ok(values)
     }
 }
 
