@@ -1,0 +1,243 @@
+"""Trains a network.
+
+    python -m voxcast_train.train --config edge/config.json --work DIR
+
+DIR holds `train/` and `tune/` (sets of `voxcast synth`) and `rig.safetensors`. The run writes `state.pt` (everything needed to
+continue), `log.jsonl` and `curve.png` there. Started again, it continues where the last saved state was; every random draw
+follows from the seed and the number of the step, so the steps are those that an uninterrupted run would have taken.
+"""
+
+import argparse
+import json
+import math
+import sys
+import time
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from .auxiliary import PixelHeads
+from .config import Config
+from .data import Frames, augment, order
+from .errors import InputError
+from .evaluate import evaluate
+from .files import replace
+from .losses import LEVEL_WEIGHTS, level_losses
+from .network import InverseMatrixVT3D, initialise
+from .plot import draw_curve
+from .rig import Rig
+
+FINAL_AUXILIARY = 0.2
+
+
+def rate(config: Config, step: int) -> float:
+    """Learning rate of a step over the peak."""
+    warm = min(1.0, (step + 1) / max(1, config.warm_up))
+    return warm * 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / config.steps)))
+
+
+def class_weights(counts: torch.Tensor, power: float) -> torch.Tensor:
+    """count^-power, scaled to a mean of 1 over the classes that occur; 1 for those that do not."""
+    weights = counts.clamp(min=1).double() ** -power
+    occurs = counts > 0
+    weights = weights / weights[occurs].mean()
+    return torch.where(occurs, weights, torch.ones_like(weights)).float()
+
+
+class Training:
+    """Model, optimiser and position of a run."""
+
+    def __init__(self, config: Config, rig: Rig, device: torch.device):
+        torch.manual_seed(config.seed)
+        self.config, self.device = config, device
+        network = config.load_network()
+        self.model = InverseMatrixVT3D(network)
+        initialise(self.model)
+        for module in self.model.modules():
+            if isinstance(module, (nn.BatchNorm2d, nn.BatchNorm3d)):
+                module.momentum = config.momentum
+        self.heads = PixelHeads(network)
+        self.model.to(device)
+        self.heads.to(device)
+        self.average = InverseMatrixVT3D(network).to(device).requires_grad_(False)
+        self.average.load_state_dict(self.model.state_dict())
+        # Tensors of the two that correspond; loading a state fills them in place.
+        averaged, trained = self.average.state_dict(), self.model.state_dict()
+        names = [name for name, tensor in averaged.items() if tensor.is_floating_point()]
+        self.averaged, self.trained = ([tensors[name] for name in names] for tensors in (averaged, trained))
+        self.rig = rig.to(device)
+        self.optimiser = self._optimiser()
+        self.step = 0
+        self.seconds = 0.0
+
+    def _optimiser(self) -> torch.optim.Optimizer:
+        config = self.config
+        groups = {}
+        for owner, module in (("model", self.model), ("heads", self.heads)):
+            for name, parameter in module.named_parameters():
+                backbone = owner == "model" and name.startswith("img_backbone.")
+                # Scales, shifts and biases are not decayed.
+                groups.setdefault((backbone, parameter.ndim > 1), []).append(parameter)
+        options = [
+            {
+                "params": parameters,
+                "factor": config.backbone_factor if backbone else 1.0,
+                "weight_decay": config.weight_decay if decayed else 0.0,
+            }
+            for (backbone, decayed), parameters in groups.items()
+        ]
+        return torch.optim.AdamW(options, lr=config.learning_rate, fused=True)
+
+    def autocast(self):
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16")
+
+    def take_step(self, frames: Frames, weights: torch.Tensor) -> dict:
+        """One batch: forward, backward, update. Returns the losses as numbers."""
+        config = self.config
+        torch.manual_seed(config.seed * 1_000_003 + self.step)
+        batch = frames.batch(order(config.seed, len(frames), config.batch, self.step))
+        images = augment(batch["images"]).to(self.device)
+        with self.autocast():
+            pyramid = self.model.pyramid(images)
+            logits = self.model.volumes(pyramid, self.rig, config.batch, levels=range(4))
+            of_class, of_depth = self.heads.losses(pyramid, batch["pixel_class"].to(self.device), batch["pixel_depth"].to(self.device))
+        parts = {}
+        total = self.auxiliary_weight() * (of_class + of_depth)
+        for level, level_weight in enumerate(LEVEL_WEIGHTS):
+            losses = level_losses(logits[level], batch["labels"][level].to(self.device), weights, config.lovasz_voxels)
+            total = total + level_weight * sum(losses.values())
+            parts.update({f"{name}{level}": loss for name, loss in losses.items()})
+        for group in self.optimiser.param_groups:
+            group["lr"] = config.learning_rate * group["factor"] * rate(config, self.step)
+        self.optimiser.zero_grad(set_to_none=True)
+        total.backward()
+        parameters = [p for group in self.optimiser.param_groups for p in group["params"]]
+        norm = nn.utils.clip_grad_norm_(parameters, config.clip)
+        if not bool(norm.isfinite()):
+            raise InputError(f"step {self.step}: the gradient is not finite; lower the learning rate")
+        self.optimiser.step()
+        self._update_average()
+        self.step += 1
+        values = {"total": total, "pixel_class": of_class, "pixel_depth": of_depth, "gradient": norm, **parts}
+        return {name: float(value) for name, value in values.items()}
+
+    def auxiliary_weight(self) -> float:
+        done = min(1.0, self.step / self.config.steps)
+        return self.config.auxiliary * (1.0 - (1.0 - FINAL_AUXILIARY) * done)
+
+    def _update_average(self) -> None:
+        # Early on the average would remember the start for too long.
+        decay = min(self.config.average, (1.0 + self.step) / (10.0 + self.step))
+        with torch.no_grad():
+            torch._foreach_lerp_(self.averaged, self.trained, 1.0 - decay)
+
+    def save(self, path: Path) -> None:
+        state = {
+            "identity": self.config.identity(),
+            "step": self.step,
+            "seconds": self.seconds,
+            "model": self.model.state_dict(),
+            "heads": self.heads.state_dict(),
+            "average": self.average.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+        }
+        replace(path, lambda temporary: torch.save(state, temporary))
+
+    def load(self, path: Path) -> None:
+        """Continues from a saved state. Raises InputError if it belongs to another config."""
+        state = torch.load(path, map_location=self.device, weights_only=True)
+        mine, found = self.config.identity(), state["identity"]
+        for key in mine:
+            if mine[key] != found.get(key):
+                raise InputError(f'{path}: "{key}": found {found.get(key)}, expected {mine[key]} of the config; remove it to start anew')
+        self.step, self.seconds = state["step"], state["seconds"]
+        self.model.load_state_dict(state["model"])
+        self.heads.load_state_dict(state["heads"])
+        self.average.load_state_dict(state["average"])
+        self.optimiser.load_state_dict(state["optimiser"])
+
+
+class Log:
+    """One JSON object a line: {"kind": "train" | "evaluate" | "sets", "step", ...}."""
+
+    def __init__(self, path: Path, step: int):
+        self.path = path
+        rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+        # Rows after the saved state belong to steps that will be taken again.
+        self.rows = [row for row in rows if row["step"] <= step]
+        text = "".join(json.dumps(row) + "\n" for row in self.rows)
+        replace(path, lambda temporary: temporary.write_text(text))
+
+    def add(self, row: dict) -> None:
+        self.rows.append(row)
+        with self.path.open("a") as file:
+            file.write(json.dumps(row) + "\n")
+
+
+def mean_of(rows: list) -> dict:
+    return {key: round(sum(row[key] for row in rows) / len(rows), 6) for key in rows[0]}
+
+
+def run(config: Config, work: Path, device: torch.device) -> None:
+    torch.set_num_threads(config.threads)
+    network = config.load_network()
+    rig = Rig.load(work / "rig.safetensors", network)
+    training = Training(config, rig, device)
+    state = work / "state.pt"
+    if state.exists():
+        training.load(state)
+    frames = Frames([work / "train"], network, pixels=True, limit=config.train.count)
+    tuning = Frames([work / "tune"], network, pixels=False, limit=config.tune.count)
+    if len(frames) != config.train.count:
+        raise InputError(f"{work / 'train'}: found {len(frames)} frames, expected {config.train.count} of the config")
+    weights = class_weights(frames.class_counts(), config.class_power).to(device)
+    log = Log(work / "log.jsonl", training.step)
+    print(f"{len(frames)} frames, {config.steps} steps of {config.batch}, from step {training.step}", flush=True)
+    recent, started = [], time.monotonic() - training.seconds
+    while training.step < config.steps:
+        recent.append(training.take_step(frames, weights))
+        training.seconds = time.monotonic() - started
+        step = training.step
+        last = step == config.steps
+        if step % config.log_every == 0 or last:
+            row = {"kind": "train", "step": step, "seconds": round(training.seconds, 1), "rate": rate(config, step - 1), **mean_of(recent)}
+            log.add(row)
+            report_progress(config, training, row, len(recent))
+            recent = []
+        if step % config.evaluate_every == 0 or last:
+            report = evaluate(training.average, rig, tuning, device, config.precision).report()
+            training.seconds = time.monotonic() - started
+            log.add({"kind": "evaluate", "step": step, "seconds": round(training.seconds, 1), **report})
+            print(f"step {step}: tuning IoU {report['all']['iou']:.2f}, mIoU {report['all']['miou']:.2f}", flush=True)
+            draw_curve(log.rows, work / "curve.png")
+        if step % config.save_every == 0 or last:
+            training.save(state)
+
+
+def report_progress(config: Config, training: Training, row: dict, steps: int) -> None:
+    left = (config.steps - training.step) * training.seconds / training.step
+    print(
+        f"step {training.step}/{config.steps}  total {row['total']:.3f}  focal {row['focal0']:.4f}  lovasz {row['lovasz0']:.3f}  "
+        f"geometric {row['geometric0']:.3f}  semantic {row['semantic0']:.3f}  pixel {row['pixel_class']:.3f} {row['pixel_depth']:.3f}  "
+        f"gradient {row['gradient']:.2f}  {training.seconds / training.step:.3f} s a step, {left / 60.0:.0f} min left",
+        flush=True,
+    )
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="voxcast_train.train", description="Train a network.")
+    parser.add_argument("--config", required=True, help="the run's JSON, beside its network.json")
+    parser.add_argument("--work", required=True, type=Path, help="holds train/, tune/ and rig.safetensors; receives the results")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    options = parser.parse_args()
+    try:
+        run(Config.load(options.config), options.work, torch.device(options.device))
+    except (InputError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
