@@ -349,7 +349,10 @@ class ViewTransformer(nn.Module):
     def forward(self, features, rig: Rig, batch):
         v1, v2, v3 = (level(x, matrices, batch) for level, x, matrices in zip(self.imvts, features, rig.levels))
         r3 = self.refine_lvl3(v3)
-        r2 = self.refine_lvl2(v2 + self.up_sample3(r3))
+        # oneDNN's bf16 gradient of a transposed convolution reads memory that nobody wrote where an axis has length 1.
+        with torch.autocast(r3.device.type, enabled=False):
+            up3 = self.up_sample3(r3.float())
+        r2 = self.refine_lvl2(v2 + up3)
         r1 = self.refine_lvl1(v1 + self.up_sample2(r2))
         return self.refine_lvl0(self.up_sample1(r1)), r1, r2, r3
 
@@ -398,8 +401,10 @@ def x_mean(device) -> Tensor:
 
 
 def initialise(model: nn.Module) -> None:
-    """He initialisation for convolutions and linear layers; PyTorch's defaults for the rest."""
+    """He initialisation for convolutions and linear layers, biases at 0; PyTorch's defaults for the rest."""
     for module in model.modules():
+        if isinstance(module, nn.ConvTranspose3d):
+            nn.init.zeros_(module.bias)
         if isinstance(module, (nn.Conv2d, nn.Conv3d, nn.Linear)):
             nn.init.kaiming_normal_(module.weight, mode="fan_in" if isinstance(module, nn.Linear) else "fan_out", nonlinearity="relu")
             if module.bias is not None:

@@ -45,6 +45,17 @@ def class_weights(counts: torch.Tensor, power: float) -> torch.Tensor:
     return torch.where(occurs, weights, torch.ones_like(weights)).float()
 
 
+def normalised_biases(model: nn.Module) -> set:
+    """Names of the biases of convolutions that a batch norm follows."""
+    names = set()
+    for prefix, module in model.named_modules():
+        if isinstance(module, nn.Sequential):
+            for (name, layer), following in zip(module.named_children(), list(module.children())[1:]):
+                if isinstance(following, (nn.BatchNorm2d, nn.BatchNorm3d)) and getattr(layer, "bias", None) is not None:
+                    names.add(f"{prefix}.{name}.bias")
+    return names
+
+
 class Training:
     """Model, optimiser and position of a run."""
 
@@ -74,8 +85,13 @@ class Training:
     def _optimiser(self) -> torch.optim.Optimizer:
         config = self.config
         groups = {}
+        # A batch norm takes away what the bias before it adds; left in, Adam would follow the rounding of its gradient.
+        redundant = normalised_biases(self.model)
         for owner, module in (("model", self.model), ("heads", self.heads)):
             for name, parameter in module.named_parameters():
+                if name in redundant:
+                    parameter.requires_grad_(False)
+                    continue
                 backbone = owner == "model" and name.startswith("img_backbone.")
                 # Scales, shifts and biases are not decayed.
                 groups.setdefault((backbone, parameter.ndim > 1), []).append(parameter)
