@@ -19,7 +19,7 @@ import made_up  # noqa: E402
 
 from voxcast_train.data import DEPTH_BINS, Frames, augment, depth_bins, order  # noqa: E402
 from voxcast_train.errors import InputError  # noqa: E402
-from voxcast_train.losses import IGNORED, level_losses, lovasz_softmax, pooled_labels  # noqa: E402
+from voxcast_train.losses import IGNORED, level_losses, lovasz_softmax, lovasz_softmax_of_some, pooled_labels  # noqa: E402
 from voxcast_train.metrics import Confusion  # noqa: E402
 from voxcast_train.network import InverseMatrixVT3D, Network  # noqa: E402
 from voxcast_train.rig import Matrix, Rig  # noqa: E402
@@ -64,6 +64,20 @@ class Losses(unittest.TestCase):
             either = ((labels == c) | (predicted == c)).sum().item()
             jaccard.append(1.0 - both / either)
         self.assertAlmostEqual(loss.item(), sum(jaccard) / 3, places=12)
+
+    def test_lovasz_of_some_is_close_to_that_of_all(self):
+        draw = torch.Generator().manual_seed(2)
+        labels = torch.randint(3, (20000,), generator=draw) * (torch.rand(20000, generator=draw) < 0.3)
+        sure = torch.rand(20000, 1, generator=draw) < 0.8
+        logits = torch.randn(20000, 3, generator=draw) + 2.0 * torch.nn.functional.one_hot(labels, 3)
+        logits = torch.where(sure, 20.0 * torch.nn.functional.one_hot(labels, 3), logits)
+        probabilities = logits.double().softmax(1)
+        every = lovasz_softmax(probabilities, labels).item()
+        # Nothing is drawn: right voxels alone are left out.
+        self.assertAlmostEqual(lovasz_softmax_of_some(probabilities, labels, 10000).item(), every, delta=0.01)
+        torch.manual_seed(3)
+        drawn = [lovasz_softmax_of_some(probabilities, labels, 1000).item() for _ in range(20)]
+        self.assertAlmostEqual(sum(drawn) / len(drawn), every, delta=0.02)
 
     def test_gradients_are_finite_at_the_ends(self):
         for name, logits, labels, weights in make_losses.cases():

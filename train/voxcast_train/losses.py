@@ -32,23 +32,50 @@ def focal(log_probabilities: Tensor, labels: Tensor, weights: Tensor | None = No
     return loss.mean()
 
 
-def lovasz_softmax(probabilities: Tensor, labels: Tensor) -> Tensor:
-    """Lovasz-softmax (arXiv 1705.08790): mean over the classes that occur in `labels` of the Lovasz extension of 1 - IoU.
+def lovasz_softmax(probabilities: Tensor, labels: Tensor, right: Tensor | None = None) -> Tensor:
+    """Lovasz-softmax (arXiv 1705.08790): mean over the classes that occur of the Lovasz extension of 1 - IoU.
 
     For class c the errors |[label = c] - p_c| are sorted downwards; each is weighted by the growth of the Jaccard loss when
-    its voxel joins the wrong ones.
+    its voxel joins the wrong ones. `right` [K] counts voxels of each class that were left out because they have hardly
+    any error: they belong to the union and stand at the end of every order.
     """
-    present = torch.bincount(labels, minlength=probabilities.shape[1]).nonzero().squeeze(1)
+    classes = probabilities.shape[1]
+    count = torch.bincount(labels, minlength=classes).to(probabilities.dtype)
+    if right is not None:
+        count = count + right
+    present = count.nonzero().squeeze(1)
     truth = labels == present.unsqueeze(1)
     errors = (truth.to(probabilities.dtype) - probabilities.t()[present]).abs()
     errors, order = errors.sort(dim=1, descending=True)
     truth = truth.gather(1, order).to(errors.dtype)
-    total = truth.sum(1, keepdim=True)
+    total = count[present].unsqueeze(1)
     intersection = total - truth.cumsum(1)
     union = total + (1.0 - truth).cumsum(1)
     jaccard = 1.0 - intersection / union
     growth = torch.cat((jaccard[:, :1], jaccard[:, 1:] - jaccard[:, :-1]), 1)
     return (errors * growth).sum(1).mean()
+
+
+SURE = 0.98
+"""A voxel whose labelled class has at least this probability is right: no class has an error above 1 - SURE there."""
+
+
+def lovasz_softmax_of_some(probabilities: Tensor, labels: Tensor, voxels: int) -> Tensor:
+    """Lovasz-softmax of the voxels that matter, at most about so many: sorting all would take longer than the network.
+
+    Voxels that are right are only counted. Of the others, `voxels` are drawn if there are more, and the counts shrink in
+    proportion.
+    """
+    p = probabilities.detach().gather(1, labels.unsqueeze(1)).squeeze(1)
+    open_ones = (p < SURE).nonzero().squeeze(1)
+    right = torch.bincount(labels, minlength=probabilities.shape[1]) - torch.bincount(
+        labels[open_ones], minlength=probabilities.shape[1]
+    )
+    right = right.to(probabilities.dtype)
+    if len(open_ones) > voxels:
+        right = right * (voxels / len(open_ones))
+        open_ones = open_ones[torch.randint(len(open_ones), (voxels,), device=labels.device)]
+    return lovasz_softmax(probabilities[open_ones], labels[open_ones], right)
 
 
 def negative_log(numerator: Tensor, denominator: Tensor) -> Tensor:
@@ -89,8 +116,8 @@ def semantic_affinity(probabilities: Tensor, labels: Tensor) -> Tensor:
 def level_losses(logits: Tensor, labels: Tensor, weights: Tensor | None = None, lovasz_voxels: int = 0) -> dict:
     """The four losses of one level by name.
 
-    `logits` [..., K], `labels` [...] with IGNORED allowed. The sort makes Lovasz-softmax the dearest of the four: with
-    `lovasz_voxels` > 0 it sees at most so many voxels, drawn anew each time, and the others see all.
+    `logits` [..., K], `labels` [...] with IGNORED allowed. Lovasz-softmax sees all voxels if `lovasz_voxels` is 0, otherwise
+    at most so many (`lovasz_softmax_of_some`); the other losses see all.
     """
     logits = logits.reshape(-1, logits.shape[-1])
     if logits.dtype != torch.float64:
@@ -104,13 +131,13 @@ def level_losses(logits: Tensor, labels: Tensor, weights: Tensor | None = None, 
         return {"focal": zero, "lovasz": zero, "geometric": zero, "semantic": zero}
     log_probabilities = F.log_softmax(logits, 1)
     probabilities = log_probabilities.exp()
-    some, some_labels = probabilities, labels
     if 0 < lovasz_voxels < len(labels):
-        drawn = torch.randint(len(labels), (lovasz_voxels,), device=labels.device)
-        some, some_labels = probabilities[drawn], labels[drawn]
+        lovasz = lovasz_softmax_of_some(probabilities, labels, lovasz_voxels)
+    else:
+        lovasz = lovasz_softmax(probabilities, labels)
     return {
         "focal": focal(log_probabilities, labels, weights),
-        "lovasz": lovasz_softmax(some, some_labels),
+        "lovasz": lovasz,
         "geometric": geometric_affinity(probabilities, labels),
         "semantic": semantic_affinity(probabilities, labels),
     }
