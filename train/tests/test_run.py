@@ -22,8 +22,10 @@ from voxcast_train.data import Frames  # noqa: E402
 from voxcast_train.errors import InputError  # noqa: E402
 from voxcast_train.evaluate import evaluate, evaluate_majority, load_model  # noqa: E402
 from voxcast_train.export import export  # noqa: E402
+from voxcast_train.network import InverseMatrixVT3D  # noqa: E402
 from voxcast_train.rig import Rig  # noqa: E402
 from voxcast_train.train import run  # noqa: E402
+from voxcast_train.workers import Worker, run_workers  # noqa: E402
 
 CPU = torch.device("cpu")
 
@@ -39,6 +41,19 @@ def voxcast(*arguments) -> str:
     done = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True)
     assert done.returncode == 0, f"voxcast {arguments}: {done.stderr}"
     return done.stdout
+
+
+def average_in_worker(work: Path, worker: Worker) -> None:
+    """The two parameters of worker r have the gradients [r + 1, r + 1] and [[10 (r + 1)]]."""
+    parameters = [torch.nn.Parameter(torch.zeros(2)), torch.nn.Parameter(torch.zeros(1, 1))]
+    for parameter, value in zip(parameters, (1.0, 10.0)):
+        parameter.grad = torch.full_like(parameter, value * (worker.rank + 1))
+    worker.average_gradients(parameters)
+    torch.save([parameter.grad for parameter in parameters], work / f"gradients{worker.rank}.pt")
+
+
+def fail_in_worker(worker: Worker) -> None:
+    raise InputError("no frames there")
 
 
 class Run(unittest.TestCase):
@@ -145,6 +160,30 @@ class Run(unittest.TestCase):
             torch.testing.assert_close(tensor, b["average"][name], rtol=1e-4, atol=1e-5, msg=name)
         a, b = ((work / "log.jsonl").read_text().splitlines() for work in (whole, parts))
         self.assertEqual([json.loads(row)["step"] for row in a], [json.loads(row)["step"] for row in b])
+
+    def test_two_workers_share_a_batch(self):
+        work = self.work_of("workers")
+        run(self.config("workers", steps=20, workers=2, threads=1), work, CPU)
+        self.assertEqual(torch.load(work / "state.pt", weights_only=True)["step"], 20)
+        rows = [json.loads(line) for line in (work / "log.jsonl").read_text().splitlines()]
+        self.assertEqual([(row["kind"], row["step"]) for row in rows], [("train", 10), ("train", 20), ("evaluate", 20)])
+        self.assertLess(rows[1]["total"], rows[0]["total"])
+        # Every frame of the tuning set was counted once, whichever worker had it.
+        network = self.config("workers", workers=2).load_network()
+        average = InverseMatrixVT3D(network)
+        average.load_state_dict(torch.load(work / "state.pt", weights_only=True)["average"])
+        alone = evaluate(average, Rig.load(work / "rig.safetensors", network), Frames([work / "tune"], network, False), CPU)
+        self.assertAlmostEqual(rows[2]["all"]["iou"], alone.report()["all"]["iou"], delta=0.5)
+
+    def test_gradients_are_averaged(self):
+        run_workers(2, average_in_worker, (self.work,))
+        for rank in range(2):
+            ours = torch.load(self.work / f"gradients{rank}.pt", weights_only=True)
+            self.assertEqual([gradient.tolist() for gradient in ours], [[1.5, 1.5], [[15.0]]])
+
+    def test_a_failing_worker_is_named(self):
+        with self.assertRaisesRegex(InputError, "no frames there"):
+            run_workers(2, fail_in_worker, ())
 
     def test_a_state_of_another_config_is_refused(self):
         work = self.work_of("other")

@@ -46,7 +46,11 @@ class Config:
     """Weight of the per-pixel losses at the start; it falls to a fifth of that along a straight line."""
     precision: str = "f32"
     """`bf16` runs convolutions in bfloat16, which is faster on CPUs with AMX and on GPUs; weights stay f32."""
+    workers: int = 1
+    """Processes that share a batch, each with its part of the frames. On CPUs, one for each core with one thread is faster
+    than one process with a thread for each core: nothing waits within an operation. BatchNorm sees a worker's part."""
     threads: int = 2
+    """Of one worker."""
     log_every: int = 20
     save_every: int = 500
     evaluate_every: int = 1000
@@ -64,6 +68,8 @@ class Config:
             raise InputError(f"{path}: {error}") from error
         if config.precision not in ("f32", "bf16"):
             raise InputError(f'{path}: "precision": found {config.precision}, expected f32 or bf16')
+        if config.batch % config.workers != 0:
+            raise InputError(f'{path}: "batch": found {config.batch}, expected a multiple of the {config.workers} workers')
         return config
 
     def load_network(self) -> Network:

@@ -39,13 +39,16 @@ def depth_bins(depth: Tensor) -> Tensor:
 class Frames:
     """All frames of one or several sets. Indexing with a list of numbers gives a batch."""
 
-    def __init__(self, directories, network: Network, pixels: bool, limit: int | None = None):
-        """Reads every frame, or the first `limit`, in the order of the directories and of the file names.
+    def __init__(self, directories, network: Network, pixels: bool, limit: int | None = None, share=(0, 1)):
+        """Reads every frame, or the first `limit`, in the order of the directories and of the file names; of these, with
+        `share` (i, n), every n-th from the i-th on.
 
         With `pixels`, per-pixel classes and depths are kept at a quarter of the image's resolution: the centre of each
         4 x 4 cell. Raises InputError for a frame of another shape or calibration than the network's and the first one's.
         """
         paths = [path for directory in directories for path in sorted(Path(directory).glob("[0-9]*.safetensors"))][:limit]
+        self.available = len(paths)
+        paths = paths[share[0] :: share[1]]
         if not paths:
             raise InputError(f"{', '.join(map(str, directories))}: no frames there")
         self.network = network

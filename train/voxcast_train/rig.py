@@ -3,6 +3,7 @@
 Nothing is projected here. `voxcast rig` decides which pixels belong to which voxel, in training as at run time.
 """
 
+import warnings
 from pathlib import Path
 
 import torch
@@ -10,6 +11,13 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from .errors import InputError
+
+
+def compressed(ptr: Tensor, col: Tensor, values: Tensor, size: tuple) -> Tensor:
+    """A sparse CSR tensor, checked."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(ptr, col, values, size, check_invariants=True)
 
 
 class GatherMean(torch.autograd.Function):
@@ -37,8 +45,8 @@ class Matrix:
         order = torch.argsort(col, stable=True)
         transposed_ptr = torch.zeros(pixels + 1, dtype=torch.int64)
         transposed_ptr[1:] = torch.bincount(col, minlength=pixels).cumsum(0)
-        self.forward = torch.sparse_csr_tensor(ptr, col, values, (rows, pixels))
-        self.backward = torch.sparse_csr_tensor(transposed_ptr, row[order], values[order], (pixels, rows))
+        self.forward = compressed(ptr, col, values, (rows, pixels))
+        self.backward = compressed(transposed_ptr, row[order], values[order], (pixels, rows))
 
     def to(self, device) -> "Matrix":
         self.forward, self.backward = self.forward.to(device), self.backward.to(device)

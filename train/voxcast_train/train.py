@@ -27,6 +27,7 @@ from .losses import LEVEL_WEIGHTS, level_losses
 from .network import InverseMatrixVT3D, initialise
 from .plot import draw_curve
 from .rig import Rig
+from .workers import Worker, run_workers
 
 FINAL_AUXILIARY = 0.2
 
@@ -59,9 +60,10 @@ def normalised_biases(model: nn.Module) -> set:
 class Training:
     """Model, optimiser and position of a run."""
 
-    def __init__(self, config: Config, rig: Rig, device: torch.device):
+    def __init__(self, config: Config, rig: Rig, device: torch.device, worker: Worker):
         torch.manual_seed(config.seed)
-        self.config, self.device = config, device
+        self.config, self.device, self.worker = config, device, worker
+        self.batch = config.batch // worker.count
         network = config.load_network()
         self.model = InverseMatrixVT3D(network)
         initialise(self.model)
@@ -109,14 +111,14 @@ class Training:
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16")
 
     def take_step(self, frames: Frames, weights: torch.Tensor) -> dict:
-        """One batch: forward, backward, update. Returns the losses as numbers."""
-        config = self.config
-        torch.manual_seed(config.seed * 1_000_003 + self.step)
-        batch = frames.batch(order(config.seed, len(frames), config.batch, self.step))
+        """One batch: forward, backward, update. Returns the losses of this worker's part as numbers."""
+        config, worker = self.config, self.worker
+        torch.manual_seed((config.seed * 1_000_003 + self.step) * worker.count + worker.rank)
+        batch = frames.batch(order(config.seed, len(frames), self.batch, self.step))
         images = augment(batch["images"]).to(self.device)
         with self.autocast():
             pyramid = self.model.pyramid(images)
-            logits = self.model.volumes(pyramid, self.rig, config.batch, levels=range(4))
+            logits = self.model.volumes(pyramid, self.rig, self.batch, levels=range(4))
             of_class, of_depth = self.heads.losses(pyramid, batch["pixel_class"].to(self.device), batch["pixel_depth"].to(self.device))
         parts = {}
         total = self.auxiliary_weight() * (of_class + of_depth)
@@ -129,6 +131,7 @@ class Training:
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()
         parameters = [p for group in self.optimiser.param_groups for p in group["params"]]
+        worker.average_gradients(parameters)
         norm = nn.utils.clip_grad_norm_(parameters, config.clip)
         if not bool(norm.isfinite()):
             raise InputError(f"step {self.step}: the gradient is not finite; lower the learning rate")
@@ -136,7 +139,11 @@ class Training:
         self._update_average()
         self.step += 1
         values = {"total": total, "pixel_class": of_class, "pixel_depth": of_depth, "gradient": norm, **parts}
-        return {name: float(value) for name, value in values.items()}
+        return {name: float(value.detach()) for name, value in values.items()}
+
+    def row(self, kind: str, **values) -> dict:
+        """A line of the log."""
+        return {"kind": kind, "step": self.step, "seconds": round(self.seconds, 1), **values}
 
     def auxiliary_weight(self) -> float:
         done = min(1.0, self.step / self.config.steps)
@@ -196,20 +203,27 @@ def mean_of(rows: list) -> dict:
 
 
 def run(config: Config, work: Path, device: torch.device) -> None:
+    """Trains until the last step, from the saved state if there is one."""
+    run_workers(config.workers, run_worker, (config, work, device))
+
+
+def run_worker(config: Config, work: Path, device: torch.device, worker: Worker) -> None:
     torch.set_num_threads(config.threads)
     network = config.load_network()
     rig = Rig.load(work / "rig.safetensors", network)
-    training = Training(config, rig, device)
+    training = Training(config, rig, device, worker)
     state = work / "state.pt"
     if state.exists():
         training.load(state)
-    frames = Frames([work / "train"], network, pixels=True, limit=config.train.count)
-    tuning = Frames([work / "tune"], network, pixels=False, limit=config.tune.count)
-    if len(frames) != config.train.count:
-        raise InputError(f"{work / 'train'}: found {len(frames)} frames, expected {config.train.count} of the config")
-    weights = class_weights(frames.class_counts(), config.class_power).to(device)
-    log = Log(work / "log.jsonl", training.step)
-    print(f"{len(frames)} frames, {config.steps} steps of {config.batch}, from step {training.step}", flush=True)
+    share = (worker.rank, worker.count)
+    frames = Frames([work / "train"], network, True, config.train.count, share)
+    tuning = Frames([work / "tune"], network, False, config.tune.count, share)
+    if frames.available != config.train.count:
+        raise InputError(f"{work / 'train'}: found {frames.available} frames, expected {config.train.count} of the config")
+    weights = class_weights(worker.sum(frames.class_counts()), config.class_power).to(device)
+    log = Log(work / "log.jsonl", training.step) if worker.first else None
+    if worker.first:
+        print(f"{frames.available} frames, {config.steps} steps of {config.batch}, from step {training.step}", flush=True)
     recent, started = [], time.monotonic() - training.seconds
     while training.step < config.steps:
         recent.append(training.take_step(frames, weights))
@@ -217,21 +231,24 @@ def run(config: Config, work: Path, device: torch.device) -> None:
         step = training.step
         last = step == config.steps
         if step % config.log_every == 0 or last:
-            row = {"kind": "train", "step": step, "seconds": round(training.seconds, 1), "rate": rate(config, step - 1), **mean_of(recent)}
-            log.add(row)
-            report_progress(config, training, row, len(recent))
+            if worker.first:
+                log.add(training.row("train", rate=rate(config, step - 1), **mean_of(recent)))
+                report_progress(config, training, log.rows[-1])
             recent = []
         if step % config.evaluate_every == 0 or last:
-            report = evaluate(training.average, rig, tuning, device, config.precision).report()
+            confusion = evaluate(training.average, rig, tuning, device, config.precision)
+            worker.sum(confusion.counts)
             training.seconds = time.monotonic() - started
-            log.add({"kind": "evaluate", "step": step, "seconds": round(training.seconds, 1), **report})
-            print(f"step {step}: tuning IoU {report['all']['iou']:.2f}, mIoU {report['all']['miou']:.2f}", flush=True)
-            draw_curve(log.rows, work / "curve.png")
-        if step % config.save_every == 0 or last:
+            if worker.first:
+                report = confusion.report()
+                log.add(training.row("evaluate", **report))
+                print(f"step {step}: tuning IoU {report['all']['iou']:.2f}, mIoU {report['all']['miou']:.2f}", flush=True)
+                draw_curve(log.rows, work / "curve.png")
+        if worker.first and (step % config.save_every == 0 or last):
             training.save(state)
 
 
-def report_progress(config: Config, training: Training, row: dict, steps: int) -> None:
+def report_progress(config: Config, training: Training, row: dict) -> None:
     left = (config.steps - training.step) * training.seconds / training.step
     print(
         f"step {training.step}/{config.steps}  total {row['total']:.3f}  focal {row['focal0']:.4f}  lovasz {row['lovasz0']:.3f}  "
