@@ -17,6 +17,8 @@ sys.path.insert(0, str(HERE))
 import make_losses  # noqa: E402
 import made_up  # noqa: E402
 
+from voxcast_train.calibrate import fit_shifts, miou_of  # noqa: E402
+from voxcast_train.config import Config  # noqa: E402
 from voxcast_train.data import DEPTH_BINS, Frames, augment, depth_bins, order  # noqa: E402
 from voxcast_train.errors import InputError  # noqa: E402
 from voxcast_train.losses import IGNORED, level_losses, lovasz_softmax, lovasz_softmax_of_some, pooled_labels  # noqa: E402
@@ -309,6 +311,48 @@ class Metrics(Place):
         self.assertEqual((report["near"]["iou"], report["far"]["iou"]), (0.0, 100.0))
         self.assertEqual(report["seen"]["classes"], [100.0, None, None, 0.0])
         self.assertEqual(report["near seen"]["classes"], [None, None, None, 0.0])
+
+
+class Calibration(unittest.TestCase):
+    def test_shifts_undo_a_wrong_prior(self):
+        torch.manual_seed(4)
+        labels = (torch.rand(20000) < 0.1).long() + (torch.rand(20000) < 0.02).long()
+        logits = 3.0 * torch.nn.functional.one_hot(labels, 3) + 1.5 * torch.randn(20000, 3)
+        shifts, before, after = fit_shifts(logits + torch.tensor([0.0, 2.0, 3.0]), labels)
+        right = fit_shifts(logits, labels)[2]
+        self.assertLess(before, right - 10.0)
+        self.assertAlmostEqual(after, right, delta=1.0)
+        self.assertEqual(shifts[0].item(), 0.0)
+        self.assertTrue(bool((shifts[1:] < -1.0).all()), shifts)
+        moved = (logits + torch.tensor([0.0, 2.0, 3.0]) + shifts).argmax(1)
+        self.assertAlmostEqual(miou_of(moved, labels, 3), after, places=6)
+
+
+class Configs(Place):
+    def config(self, **changes):
+        sets = {name: {"first": 0, "count": 1} for name in ("train", "tune", "held_out")}
+        path = self.place / "config.json"
+        path.write_text(json.dumps({**sets, "steps": 10, "batch": 2, **changes}))
+        return Config.load(path)
+
+    def test_phases(self):
+        config = self.config(phases=[{"start": 0}, {"start": 5, "lovasz": 3}])
+        self.assertEqual([config.phase(step).lovasz for step in (0, 4, 5, 9)], [1.0, 1.0, 3.0, 3.0])
+        self.assertEqual(config.identity(), self.config(steps=20).identity())
+        self.assertNotEqual(config.identity(), self.config(batch=4).identity())
+
+    def test_faults_are_named(self):
+        for changes, message in (
+            ({"phases": [{"start": 1}]}, r"phases.*\[1\]"),
+            ({"phases": []}, "phases"),
+            ({"phases": [{"start": 0, "nonsense": 1}]}, "nonsense"),
+            ({"nonsense": 1}, "nonsense"),
+            ({"precision": "f16"}, "precision"),
+            ({"workers": 3}, "multiple of the 3 workers"),
+            ({"train": {"first": 0}}, "count"),
+        ):
+            with self.subTest(changes), self.assertRaisesRegex(InputError, message):
+                self.config(**changes)
 
 
 if __name__ == "__main__":

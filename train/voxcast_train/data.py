@@ -55,12 +55,13 @@ class Frames:
         self.pixels = pixels
         self.paths = paths
         self.lidar2img = None
-        columns = {}
-        for path in paths:
+        # Rows are written in place: frames kept one by one between temporaries would leave the heap full of holes.
+        self.columns = {}
+        for number, path in enumerate(paths):
             for key, value in self._read(path).items():
-                columns.setdefault(key, []).append(value)
-            # Two copies of the whole set would not fit: each column is stacked and its parts dropped in turn.
-        self.columns = {key: torch.stack(columns.pop(key)) for key in list(columns)}
+                if number == 0:
+                    self.columns[key] = torch.empty((len(paths), *value.shape), dtype=value.dtype)
+                self.columns[key][number] = value
 
     def _read(self, path: Path) -> dict:
         network = self.network

@@ -41,17 +41,24 @@ def evaluate_majority(majority: torch.Tensor, frames: Frames) -> Confusion:
     return confusion
 
 
-def load_model(network: Network, checkpoint) -> InverseMatrixVT3D:
-    """A model with the weights of an exported checkpoint. Raises InputError for names or shapes that do not fit."""
+def model_of(network: Network, weights: dict) -> InverseMatrixVT3D:
+    """A model with these weights, in evaluation mode. Raises InputError for names or shapes that do not fit."""
     model = InverseMatrixVT3D(network)
-    weights = load_file(checkpoint)
     own = model.state_dict()
     missing = [name for name in own if name not in weights and not name.endswith("num_batches_tracked")]
     wrong = [name for name in weights if name not in own or own[name].shape != weights[name].shape]
     if missing or wrong:
-        raise InputError(f"{checkpoint}: not a checkpoint of this network: lacks {missing[:3]}, does not fit {wrong[:3]}")
+        raise InputError(f"not weights of this network: {missing[:3]} are missing, {wrong[:3]} do not fit")
     model.load_state_dict(weights, strict=False)
     return model.eval()
+
+
+def load_model(network: Network, checkpoint) -> InverseMatrixVT3D:
+    """A model with the weights of an exported checkpoint. Raises InputError naming the file."""
+    try:
+        return model_of(network, load_file(checkpoint))
+    except InputError as error:
+        raise InputError(f"{checkpoint}: {error}") from error
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""From seeds to a model: makes the sets, builds the rig, trains, exports, imports, evaluates.
+"""From seeds to a model: makes the sets, builds the rig, trains, calibrates, exports, imports, evaluates.
 
     python -m voxcast_train.reproduce --config edge/config.json --work DIR --voxcast ../target/release/voxcast
 
@@ -13,6 +13,7 @@ from pathlib import Path
 
 import torch
 
+from .calibrate import calibrated
 from .config import Config, Seeds
 from .data import Frames
 from .errors import InputError
@@ -55,14 +56,15 @@ def reproduce(config: Config, work: Path, voxcast: Program, device: torch.device
     voxcast("rig", first, "--network", network_path, "-o", work / "rig.safetensors")
     run(config, work, device)
     state = torch.load(work / "state.pt", map_location="cpu", weights_only=True)
-    export(state["average"], work / "checkpoint.safetensors")
+    rig = Rig.load(work / "rig.safetensors", network)
+    tuning = Frames([work / "tune"], network, pixels=False, limit=config.tune.count)
+    export(calibrated(state["average"], network, rig, tuning), work / "checkpoint.safetensors")
     voxcast("import", work / "checkpoint.safetensors", "--network", network_path, "--precision", "f16", "-o", work / "model.safetensors")
-    rig = Rig.load(work / "rig.safetensors", network).to(device)
-    held_out = Frames([work / "held-out"], network, pixels=False)
-    majority = Frames([work / "train"], network, pixels=False).majority()
+    held_out = Frames([work / "held-out"], network, pixels=False, limit=config.held_out.count)
+    majority = Frames([work / "train"], network, pixels=False, limit=config.train.count).majority()
     model = load_model(network, work / "checkpoint.safetensors").to(device)
     reports = {
-        "network": evaluate(model, rig, held_out, device).report(),
+        "network": evaluate(model, rig.to(device), held_out, device).report(),
         "majority": evaluate_majority(majority, held_out).report(),
     }
     text = json.dumps({"frames": len(held_out), "steps": state["step"], **reports}, indent=1) + "\n"

@@ -110,8 +110,11 @@ class Training:
     def autocast(self):
         return torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.precision == "bf16")
 
-    def take_step(self, frames: Frames, weights: torch.Tensor) -> dict:
-        """One batch: forward, backward, update. Returns the losses of this worker's part as numbers."""
+    def take_step(self, frames: Frames, counts: torch.Tensor) -> dict:
+        """One batch: forward, backward, update. Returns the losses of this worker's part as numbers.
+
+        `counts` are the voxels of each class over all frames of all workers.
+        """
         config, worker = self.config, self.worker
         torch.manual_seed((config.seed * 1_000_003 + self.step) * worker.count + worker.rank)
         batch = frames.batch(order(config.seed, len(frames), self.batch, self.step))
@@ -121,10 +124,12 @@ class Training:
             logits = self.model.volumes(pyramid, self.rig, self.batch, levels=range(4))
             of_class, of_depth = self.heads.losses(pyramid, batch["pixel_class"].to(self.device), batch["pixel_depth"].to(self.device))
         parts = {}
+        phase = config.phase(self.step)
+        weights = class_weights(counts, phase.class_power).to(self.device)
         total = self.auxiliary_weight() * (of_class + of_depth)
         for level, level_weight in enumerate(LEVEL_WEIGHTS):
             losses = level_losses(logits[level], batch["labels"][level].to(self.device), weights, config.lovasz_voxels)
-            total = total + level_weight * sum(losses.values())
+            total = total + level_weight * sum(getattr(phase, name) * loss for name, loss in losses.items())
             parts.update({f"{name}{level}": loss for name, loss in losses.items()})
         for group in self.optimiser.param_groups:
             group["lr"] = config.learning_rate * group["factor"] * rate(config, self.step)
@@ -220,13 +225,14 @@ def run_worker(config: Config, work: Path, device: torch.device, worker: Worker)
     tuning = Frames([work / "tune"], network, False, config.tune.count, share)
     if frames.available != config.train.count:
         raise InputError(f"{work / 'train'}: found {frames.available} frames, expected {config.train.count} of the config")
-    weights = class_weights(worker.sum(frames.class_counts()), config.class_power).to(device)
+    counts = worker.sum(frames.class_counts())
     log = Log(work / "log.jsonl", training.step) if worker.first else None
     if worker.first:
         print(f"{frames.available} frames, {config.steps} steps of {config.batch}, from step {training.step}", flush=True)
     recent, started = [], time.monotonic() - training.seconds
     while training.step < config.steps:
-        recent.append(training.take_step(frames, weights))
+        worker.check()
+        recent.append(training.take_step(frames, counts))
         training.seconds = time.monotonic() - started
         step = training.step
         last = step == config.steps

@@ -1,5 +1,6 @@
 """Several processes that train one model together, each on its own frames."""
 
+import os
 import tempfile
 from pathlib import Path
 
@@ -15,10 +16,16 @@ class Worker:
 
     def __init__(self, rank: int = 0, count: int = 1):
         self.rank, self.count = rank, count
+        self.parent = os.getppid()
 
     @property
     def first(self) -> bool:
         return self.rank == 0
+
+    def check(self) -> None:
+        """Raises InputError if the process that started the workers is gone: nobody else would stop them."""
+        if self.count > 1 and os.getppid() != self.parent:
+            raise InputError("the process that started this worker is gone")
 
     def sum(self, tensor: Tensor) -> Tensor:
         """The sum over all workers, in place."""
