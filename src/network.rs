@@ -139,8 +139,8 @@ impl Network {
                 ..nuscenes_256
             }),
             "edge" => Some(Network {
-                depths: [2, 2, 2, 2],
-                width: 24,
+                depths: [2, 2, 3, 1],
+                width: 32,
                 dcn: [false; 4],
                 block: Block::Basic,
                 fpn: 64,

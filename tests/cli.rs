@@ -205,6 +205,8 @@ fn the_whole_path() {
     let built = fs::read(&rig).unwrap();
     done(&["rig", &place.text("scene/calibration.json"), "--model", &model, "-o", &rig, "--threads", "3"]);
     assert_eq!(fs::read(&rig).unwrap(), built);
+    done(&["rig", &scene, "--network", &net, "-o", &rig]);
+    assert_eq!(fs::read(&rig).unwrap(), built, "matrices follow from the network alone");
 
     let run = |more: &[&str]| -> Value {
         let arguments = [&["run", "--model", &model, &scene, "-o", &out, "--json"][..], more].concat();
@@ -308,6 +310,8 @@ fn help_and_usage() {
         &["import", "a.pth", "--network", "x", "-o", "b", "--precision", "f8"],
         &["import", "a.pth", "--network", "x", "-o", "b", "--fold", "paper"],
         &["rig", "--model", "m", "-o", "x"],
+        &["rig", "s", "-o", "x"],
+        &["rig", "s", "--model", "m", "--network", "n", "-o", "x"],
         &["inspect"],
         &["inspect", "m", "--cameras", "65"],
         &["profile", "--model", "m", "scene", "--by", "day"],

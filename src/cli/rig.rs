@@ -1,24 +1,30 @@
 //! `voxcast rig`
 
-use super::{Machine, frame, terminal};
+use super::{Machine, frame, import, terminal};
 use clap::Args;
 use std::path::PathBuf;
 use std::time::Instant;
-use voxcast::{Model, Result};
+use voxcast::{Model, Network, Result};
 
 /// Build the six projection matrices of a scene's cameras and write them as a rig, which `run` maps.
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Examples:
   voxcast rig scene/ --model model.safetensors -o rig.safetensors
-  voxcast rig scene/calibration.json --model model.safetensors -o rig.safetensors")]
+  voxcast rig scene/calibration.json --model model.safetensors -o rig.safetensors
+  voxcast rig scene/ --network network.json -o rig.safetensors
+
+Matrices depend on a network's sizes, not on its weights, so that a network which is still to be trained has its rig too.")]
 pub struct BuildRig {
     /// A scene, or only its calibration.json
     #[arg(value_name = "SCENE|CALIBRATION.json")]
     scene: PathBuf,
     /// The model whose network the matrices are for
-    #[arg(long)]
-    model: PathBuf,
+    #[arg(long, required_unless_present = "network")]
+    model: Option<PathBuf>,
+    /// The network, where there is no model yet: nuscenes-200, nuscenes-256, semantickitti-256, or a network.json
+    #[arg(long, value_name = "NAME|FILE.json", conflicts_with = "model")]
+    network: Option<String>,
     /// The rig to write
     #[arg(short, long, value_name = "RIG")]
     output: PathBuf,
@@ -28,16 +34,16 @@ pub struct BuildRig {
 
 impl BuildRig {
     pub fn run(self) -> Result<()> {
-        let model = Model::open(&self.model)?;
+        let network = self.network()?;
         let lidar2img = frame::calibration(&self.scene)?;
         let threads = self.machine.threads()?;
-        let mut builder = voxcast::rig::RigBuilder::new(model.network(), lidar2img.len(), self.machine.isa()?)
-            .map_err(|e| e.in_file(&self.model))?
+        let mut builder = voxcast::rig::RigBuilder::new(&network, lidar2img.len(), self.machine.isa()?)
+            .map_err(|e| e.in_file(&self.scene))?
             .with_threads(threads.clone());
         let start = Instant::now();
         let rig = builder.build(&lidar2img).map_err(|e| e.in_file(&self.scene))?;
         let elapsed = start.elapsed();
-        rig.save(&self.output, model.network())?;
+        rig.save(&self.output, &network)?;
         for index in 0..3 {
             let level = rig.level(index);
             for (name, matrix) in [("volume", level.volume), ("bev", level.bev)] {
@@ -51,5 +57,13 @@ impl BuildRig {
         }
         println!("six matrices in {} on {} threads", terminal::time(elapsed), threads.count());
         Ok(())
+    }
+
+    /// What `--model` or `--network` names; clap has seen to it that one of them is there.
+    fn network(&self) -> Result<Network> {
+        match (&self.model, &self.network) {
+            (Some(path), _) => Ok(Model::open(path)?.network().clone()),
+            (None, name) => import::read_network(name.as_deref().unwrap_or_default()),
+        }
     }
 }

@@ -1,0 +1,196 @@
+"""A whole run on made-up frames, through the program that will use its result. Needs a built `voxcast`."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import unittest
+from pathlib import Path
+
+import numpy
+import torch
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent))
+sys.path.insert(0, str(HERE))
+
+import made_up  # noqa: E402
+
+from voxcast_train.config import Config  # noqa: E402
+from voxcast_train.data import Frames  # noqa: E402
+from voxcast_train.errors import InputError  # noqa: E402
+from voxcast_train.evaluate import evaluate, evaluate_majority, load_model  # noqa: E402
+from voxcast_train.export import export  # noqa: E402
+from voxcast_train.network import InverseMatrixVT3D  # noqa: E402
+from voxcast_train.rig import Rig  # noqa: E402
+from voxcast_train.train import run  # noqa: E402
+from voxcast_train.workers import Worker, run_workers  # noqa: E402
+
+CPU = torch.device("cpu")
+
+
+def voxcast(*arguments) -> str:
+    """Runs the program: $VOXCAST, or the newest build in target/."""
+    program = os.environ.get("VOXCAST")
+    if program is None:
+        built = [HERE.parents[1] / "target" / kind / "voxcast" for kind in ("release", "debug")]
+        built = [path for path in built if path.exists()]
+        assert built, "no voxcast in target/: run `cargo build --release`, or name one with VOXCAST"
+        program = max(built, key=lambda path: path.stat().st_mtime)
+    done = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True)
+    assert done.returncode == 0, f"voxcast {arguments}: {done.stderr}"
+    return done.stdout
+
+
+def average_in_worker(work: Path, worker: Worker) -> None:
+    """The two parameters of worker r have the gradients [r + 1, r + 1] and [[10 (r + 1)]]."""
+    parameters = [torch.nn.Parameter(torch.zeros(2)), torch.nn.Parameter(torch.zeros(1, 1))]
+    for parameter, value in zip(parameters, (1.0, 10.0)):
+        parameter.grad = torch.full_like(parameter, value * (worker.rank + 1))
+    worker.average_gradients(parameters)
+    torch.save([parameter.grad for parameter in parameters], work / f"gradients{worker.rank}.pt")
+
+
+def fail_in_worker(worker: Worker) -> None:
+    raise InputError("no frames there")
+
+
+class Run(unittest.TestCase):
+    @classmethod
+    def setUpClass(cls):
+        cls.place = tempfile.TemporaryDirectory()
+        cls.work = Path(cls.place.name)
+        made_up.write_network(cls.work)
+        made_up.write_set(cls.work / "train", 0, 8)
+        made_up.write_set(cls.work / "tune", 100, 4)
+        frame = next((cls.work / "train").iterdir())
+        voxcast("rig", frame, "--network", cls.work / "network.json", "-o", cls.work / "rig.safetensors")
+
+    @classmethod
+    def tearDownClass(cls):
+        cls.place.cleanup()
+
+    def config(self, name: str, **changes) -> Config:
+        values = {
+            "train": {"first": 0, "count": 8},
+            "tune": {"first": 100, "count": 4},
+            "held_out": {"first": 200, "count": 0},
+            "steps": 150,
+            "batch": 4,
+            "learning_rate": 4e-3,
+            "warm_up": 5,
+            "average": 0.9,
+            "momentum": 0.1,
+            "log_every": 10,
+            "save_every": 20,
+            "evaluate_every": 50,
+        }
+        path = self.work / f"{name}.json"
+        path.write_text(json.dumps({**values, **changes}))
+        return Config.load(path)
+
+    def work_of(self, name: str) -> Path:
+        """A directory of its own for a run, which shares the sets and the rig."""
+        directory = self.work / name
+        directory.mkdir()
+        for shared in ("train", "tune", "rig.safetensors"):
+            (directory / shared).symlink_to(self.work / shared)
+        return directory
+
+    def test_it_learns_and_the_runtime_agrees(self):
+        config, work = self.config("whole"), self.work_of("whole")
+        run(config, work, CPU)
+        rows = [json.loads(line) for line in (work / "log.jsonl").read_text().splitlines()]
+        losses = [row["total"] for row in rows if row["kind"] == "train"]
+        self.assertLess(losses[-1], 0.6 * losses[0])
+        evaluations = [row for row in rows if row["kind"] == "evaluate"]
+        self.assertEqual([row["step"] for row in evaluations], [50, 100, 150])
+        self.assertGreater((work / "curve.png").stat().st_size, 10_000)
+
+        network = config.load_network()
+        rig = Rig.load(work / "rig.safetensors", network)
+        frames = Frames([work / "tune"], network, pixels=False)
+        export(torch.load(work / "state.pt", weights_only=True)["average"], work / "checkpoint.safetensors")
+        model = load_model(network, work / "checkpoint.safetensors")
+        ours = evaluate(model, rig, frames, CPU).report()
+        baseline = evaluate_majority(Frames([work / "train"], network, pixels=False).majority(), frames).report()
+        self.assertGreater(ours["all"]["iou"], 70.0)
+        self.assertGreater(ours["all"]["miou"], 2.0 * baseline["all"]["miou"])
+
+        # The same weights, rig and frame through the runtime.
+        voxcast("import", work / "checkpoint.safetensors", "--network", self.work / "network.json", "-o", work / "model")
+        frame = frames.paths[1]
+        voxcast("run", "--model", work / "model", "--rig", work / "rig.safetensors", frame, "--logits", "-o", work / "out.npz")
+        with torch.no_grad():
+            logits = model(frames.batch([1])["images"], rig)[0][0].numpy()
+        theirs = numpy.load(work / "out.npz")
+        self.assertEqual(theirs["logits"].shape, logits.shape)
+        scale = float(numpy.sqrt((logits**2).mean()))
+        difference = float(numpy.abs(theirs["logits"] - logits).max())
+        self.assertLess(difference, 2e-3 * scale, "PyTorch and voxcast differ")
+        self.assertGreater(scale, 0.5)
+        self.assertGreater(float((theirs["classes"] == logits.argmax(-1)).mean()), 0.999)
+
+    def test_an_interrupted_run_takes_the_same_steps(self):
+        whole, parts = self.work_of("uninterrupted"), self.work_of("interrupted")
+        run(self.config("steps40", steps=40), whole, CPU)
+
+        class Interrupt(Exception):
+            pass
+
+        import voxcast_train.train as module
+
+        real = module.Training.take_step
+
+        def failing(training, *arguments):
+            if training.step == 27:
+                raise Interrupt
+            return real(training, *arguments)
+
+        module.Training.take_step = failing
+        try:
+            with self.assertRaises(Interrupt):
+                run(self.config("steps40", steps=40), parts, CPU)
+        finally:
+            module.Training.take_step = real
+        run(self.config("steps40", steps=40), parts, CPU)
+        a, b = (torch.load(work / "state.pt", weights_only=True) for work in (whole, parts))
+        for name, tensor in a["average"].items():
+            torch.testing.assert_close(tensor, b["average"][name], rtol=1e-4, atol=1e-5, msg=name)
+        a, b = ((work / "log.jsonl").read_text().splitlines() for work in (whole, parts))
+        self.assertEqual([json.loads(row)["step"] for row in a], [json.loads(row)["step"] for row in b])
+
+    def test_two_workers_share_a_batch(self):
+        work = self.work_of("workers")
+        run(self.config("workers", steps=20, workers=2, threads=1), work, CPU)
+        self.assertEqual(torch.load(work / "state.pt", weights_only=True)["step"], 20)
+        rows = [json.loads(line) for line in (work / "log.jsonl").read_text().splitlines()]
+        self.assertEqual([(row["kind"], row["step"]) for row in rows], [("train", 10), ("train", 20), ("evaluate", 20)])
+        self.assertLess(rows[1]["total"], rows[0]["total"])
+        # Every frame of the tuning set was counted once, whichever worker had it.
+        network = self.config("workers", workers=2).load_network()
+        average = InverseMatrixVT3D(network)
+        average.load_state_dict(torch.load(work / "state.pt", weights_only=True)["average"])
+        alone = evaluate(average, Rig.load(work / "rig.safetensors", network), Frames([work / "tune"], network, False), CPU)
+        self.assertAlmostEqual(rows[2]["all"]["iou"], alone.report()["all"]["iou"], delta=0.5)
+
+    def test_gradients_are_averaged(self):
+        run_workers(2, average_in_worker, (self.work,))
+        for rank in range(2):
+            ours = torch.load(self.work / f"gradients{rank}.pt", weights_only=True)
+            self.assertEqual([gradient.tolist() for gradient in ours], [[1.5, 1.5], [[15.0]]])
+
+    def test_a_failing_worker_is_named(self):
+        with self.assertRaisesRegex(InputError, "no frames there"):
+            run_workers(2, fail_in_worker, ())
+
+    def test_a_state_of_another_config_is_refused(self):
+        work = self.work_of("other")
+        run(self.config("first", steps=20), work, CPU)
+        with self.assertRaisesRegex(InputError, '"learning_rate": found 0.004, expected 0.02'):
+            run(self.config("second", steps=20, learning_rate=2e-2), work, CPU)
+
+
+if __name__ == "__main__":
+    unittest.main()

@@ -1,0 +1,1 @@
+"""Training of networks that voxcast runs. See README.md beside this package."""

@@ -1,0 +1,110 @@
+"""What a training run is: a JSON file beside the network.json that it trains."""
+
+import json
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+
+from .errors import InputError
+from .network import Network
+
+
+@dataclass(frozen=True)
+class Seeds:
+    """A set of frames: `voxcast synth --seed first --count count`."""
+
+    first: int
+    count: int
+
+
+@dataclass(frozen=True)
+class Phase:
+    """How the losses are weighted from step `start` on.
+
+    The affinities teach fast, but where a place is uncertain they prefer too much of a rare class to too little. What is
+    measured in the end is IoU, which Lovasz-softmax follows.
+    """
+
+    start: int = 0
+    focal: float = 1.0
+    lovasz: float = 1.0
+    geometric: float = 1.0
+    semantic: float = 1.0
+    class_power: float = 0.25
+    """Class weights of the focal loss are (count of a class)^-power, scaled to a mean of 1 over the classes that occur."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Every number that decides a run, together with the sets and the rig."""
+
+    train: Seeds
+    tune: Seeds
+    held_out: Seeds
+    steps: int
+    batch: int
+    network: str = "network.json"
+    seed: int = 0
+    learning_rate: float = 2e-3
+    """Peak; reached linearly over `warm_up` steps, then falling to nothing along a cosine."""
+    warm_up: int = 200
+    backbone_factor: float = 1.0
+    """The backbone's learning rate over that of the rest. Fine-tuning wants 0.1."""
+    weight_decay: float = 0.01
+    clip: float = 10.0
+    """Largest norm of the gradient of all parameters together."""
+    momentum: float = 0.05
+    """Share of the newest batch in BatchNorm's running statistics."""
+    average: float = 0.998
+    """Decay of the running average of the weights, which is what is evaluated and exported."""
+    phases: tuple = (Phase(),)
+    lovasz_voxels: int = 20000
+    auxiliary: float = 0.5
+    """Weight of the per-pixel losses at the start; it falls to a fifth of that along a straight line."""
+    precision: str = "f32"
+    """`bf16` runs convolutions in bfloat16, which is faster on CPUs with AMX and on GPUs; weights stay f32."""
+    workers: int = 1
+    """Processes that share a batch, each with its part of the frames. On CPUs, one for each core with one thread is faster
+    than one process with a thread for each core: nothing waits within an operation. BatchNorm sees a worker's part."""
+    threads: int = 2
+    """Of one worker."""
+    log_every: int = 20
+    save_every: int = 500
+    evaluate_every: int = 1000
+    directory: Path = field(default=Path("."), compare=False)
+
+    @staticmethod
+    def load(path) -> "Config":
+        """Reads a config. Raises InputError naming the file and the key."""
+        path = Path(path)
+        try:
+            values = json.loads(path.read_text())
+            sets = {key: Seeds(**values.pop(key)) for key in ("train", "tune", "held_out")}
+            if "phases" in values:
+                values["phases"] = tuple(Phase(**phase) for phase in values["phases"])
+            config = Config(**sets, **values, directory=path.parent)
+        except (KeyError, TypeError, json.JSONDecodeError) as error:
+            raise InputError(f"{path}: {error}") from error
+        if config.precision not in ("f32", "bf16"):
+            raise InputError(f'{path}: "precision": found {config.precision}, expected f32 or bf16')
+        starts = [phase.start for phase in config.phases]
+        if starts[:1] != [0] or starts != sorted(set(starts)):
+            raise InputError(f'{path}: "phases": found starts {starts}, expected ascending ones from 0 on')
+        if config.batch % config.workers != 0:
+            raise InputError(f'{path}: "batch": found {config.batch}, expected a multiple of the {config.workers} workers')
+        return config
+
+    def load_network(self) -> Network:
+        return Network.load(self.directory / self.network)
+
+    def phase(self, step: int) -> Phase:
+        """The phase that a step belongs to."""
+        return [phase for phase in self.phases if phase.start <= step][-1]
+
+    def identity(self) -> dict:
+        """What must not change between a run and its continuation. A run may be made longer or shorter, and get
+        other phases: from then on, the new ones count."""
+        values = asdict(self)
+        for key in ("directory", "steps", "phases", "threads", "log_every", "save_every", "evaluate_every", "tune", "held_out"):
+            del values[key]
+        assert set(values) < {f.name for f in fields(self)}
+        return values
