@@ -9,7 +9,9 @@
 //! predicted empty.
 
 mod confusion;
+pub mod losses;
 mod majority;
+pub mod ray_iou;
 mod report;
 
 pub use confusion::Confusion;
