@@ -47,12 +47,14 @@ impl Grid {
 }
 
 /// What is known about a frame's voxels, `[x, y, z]`, z fastest.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Truth {
     /// Class of each voxel, 0 is empty; [`IGNORED`] counts nowhere.
     pub labels: Vec<u8>,
     /// For each of [`DataSet::masks`], 1 for the voxels that belong to it, else 0.
     pub masks: Vec<Vec<u8>>,
+    /// Where the rays of [`ray_iou`](crate::eval::ray_iou) begin, in metres of the grid.
+    pub origins: Vec<[f64; 3]>,
 }
 
 /// A frame: what a network gets, and what it should say.
@@ -62,8 +64,6 @@ pub struct Frame {
     pub scene: Scene,
     /// The labels.
     pub truth: Truth,
-    /// Where rays of [`RayIoU`](crate::eval::ray_iou) begin: places of the lidar in this frame's lidar frame, metres.
-    pub origins: Vec<[f64; 3]>,
 }
 
 /// Frames with labels.

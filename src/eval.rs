@@ -1,8 +1,8 @@
 //! Evaluation: how well a prediction agrees with the labels of a data set.
 //!
 //! A [`Scorer`] compares one frame's prediction with its truth and gives a [`Score`], which is counts; scores
-//! add up, and the ratios of the sum are those of the whole set, not means of frames. Counts are integers, so that a total does
-//! not depend on the order of the frames or on how many were scored at once.
+//! add up, and the ratios of the sum are those of the whole set, not means of frames. All but the losses are integers, so
+//! that their total does not depend on the order of the frames; losses are to be added in the order of the set.
 //!
 //! Truth is never changed to suit a network. Where its voxels are not the network's, each labelled voxel is compared with
 //! the predicted voxel that contains its centre; where there is none, the network has said nothing, and it counts as
@@ -21,6 +21,9 @@ pub use report::Report;
 use crate::dataset::{Grid, IGNORED, Truth};
 use crate::error::{Error, Result};
 use crate::replace::replace_file;
+use losses::{Losses, losses};
+use ray_iou::{RayCounts, count_rays};
+use std::borrow::Cow;
 use std::io::Write;
 use std::path::Path;
 
@@ -32,6 +35,8 @@ pub struct Prediction<'a> {
     /// By how many feature pixels each voxel is seen ([`Occupancy::support`](crate::Occupancy::support)), where the
     /// prediction comes from images.
     pub support: Option<&'a [u16]>,
+    /// Logits `[x, y, z, classes]`, if the losses are to be known. Truth must then have the prediction's grid.
+    pub logits: Option<&'a [f32]>,
 }
 
 /// What to score.
@@ -55,6 +60,7 @@ pub struct Scorer {
     prediction: Grid,
     masks: usize,
     rings: usize,
+    directions: Vec<[f64; 3]>,
     /// Ring of each column (x, y) of the truth.
     ring_of: Vec<u8>,
     /// For each axis and index of the truth, the index in the prediction; none where the two grids are one.
@@ -83,7 +89,8 @@ impl Scorer {
             }
         }
         let nearest = (truth != prediction).then(|| [0, 1, 2].map(|axis| nearest(&truth, &prediction, axis)));
-        Ok(Self { classes, truth, prediction, masks, rings: rings.len() + 1, ring_of, nearest })
+        let directions = ray_iou::directions();
+        Ok(Self { classes, truth, prediction, masks, rings: rings.len() + 1, directions, ring_of, nearest })
     }
 
     /// Names of the regions that scores are told apart by: "all" voxels, those of each mask, and those that the rig
@@ -100,6 +107,12 @@ impl Scorer {
     pub fn score(&self, truth: &Truth, prediction: &Prediction<'_>) -> Result<Score> {
         self.check(truth, prediction)?;
         let mut score = Score::new(self.classes, self.masks + 2, self.rings);
+        let resampled = self.resampled(prediction.classes);
+        let (grid, classes) = (&self.truth, self.classes);
+        score.rays = count_rays(grid, classes, &truth.labels, &resampled, &truth.origins, &self.directions);
+        if let Some(logits) = prediction.logits {
+            score.losses.add(&losses(logits, &truth.labels, classes, None));
+        }
         let [nx, ny, nz] = self.truth.size;
         let columns = (0..nx).flat_map(|x| (0..ny).map(move |y| [x, y]));
         for (([x, y], &ring), first) in columns.zip(&self.ring_of).zip((0..).step_by(nz)) {
@@ -110,7 +123,7 @@ impl Scorer {
                     continue;
                 }
                 let at = self.predicted_voxel([x, y, z]);
-                let class = at.map_or(0, |at| prediction.classes[at]);
+                let class = resampled[first + z];
                 score.regions[0][ring].add(label, class);
                 for (mask, region) in truth.masks.iter().zip(1..) {
                     if mask[first + z] != 0 {
@@ -123,6 +136,16 @@ impl Scorer {
             }
         }
         Ok(score)
+    }
+
+    /// The prediction on the grid of the truth.
+    fn resampled<'a>(&self, classes: &'a [u8]) -> Cow<'a, [u8]> {
+        if self.nearest.is_none() {
+            return Cow::Borrowed(classes);
+        }
+        let [nx, ny, nz] = self.truth.size;
+        let voxels = (0..nx).flat_map(|x| (0..ny).flat_map(move |y| (0..nz).map(move |z| [x, y, z])));
+        Cow::Owned(voxels.map(|voxel| self.predicted_voxel(voxel).map_or(0, |at| classes[at])).collect())
     }
 
     /// Where the prediction speaks of voxel `[x, y, z]` of the truth; nowhere if that lies outside its grid.
@@ -150,6 +173,13 @@ impl Scorer {
         }
         check("predicted voxels", prediction.classes.len(), predicted)?;
         check("voxels with support", prediction.support.map_or(predicted, <[u16]>::len), predicted)?;
+        if let Some(logits) = prediction.logits {
+            if self.nearest.is_some() {
+                let message = "losses need labels on the grid of the network, which these are not";
+                return Err(Error::mismatch(message));
+            }
+            check("logits", logits.len(), predicted * self.classes)?;
+        }
         let beyond = |class: &u8| usize::from(*class) >= self.classes;
         let label = truth.labels.iter().find(|label| beyond(label) && **label != IGNORED);
         if let Some(found) = label.or_else(|| prediction.classes.iter().find(|class| beyond(class))) {
@@ -170,16 +200,58 @@ fn nearest(truth: &Grid, prediction: &Grid, axis: usize) -> Vec<Option<usize>> {
 }
 
 /// The score of a frame, or of many: a confusion for each region and ring.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Score {
     /// For each of [`Scorer::regions`], for each ring of [`Options::rings`] and for what lies beyond the last.
     pub regions: Vec<Vec<Confusion>>,
+    /// What rays meet, in [`Truth::origins`].
+    pub rays: RayCounts,
+    /// Losses of level 0 of the frames whose logits were given.
+    pub losses: LossSum,
+}
+
+/// Losses, summed over frames.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct LossSum {
+    /// Frames counted.
+    pub frames: u64,
+    /// Their sum.
+    pub sum: Losses,
+}
+
+impl LossSum {
+    /// Counts a frame.
+    pub fn add(&mut self, losses: &Losses) {
+        self.merge(&LossSum { frames: 1, sum: *losses });
+    }
+
+    /// Adds another sum.
+    pub fn merge(&mut self, other: &LossSum) {
+        self.frames += other.frames;
+        self.sum.focal += other.sum.focal;
+        self.sum.lovasz += other.sum.lovasz;
+        self.sum.geometric += other.sum.geometric;
+        self.sum.semantic += other.sum.semantic;
+    }
+
+    /// The mean of a frame; none without frames.
+    pub fn mean(&self) -> Option<Losses> {
+        let share = |sum: f64| sum / self.frames as f64;
+        let Losses { focal, lovasz, geometric, semantic } = self.sum;
+        (self.frames > 0).then(|| Losses {
+            focal: share(focal),
+            lovasz: share(lovasz),
+            geometric: share(geometric),
+            semantic: share(semantic),
+        })
+    }
 }
 
 impl Score {
     /// Nothing counted.
     pub fn new(classes: usize, regions: usize, rings: usize) -> Self {
-        Self { regions: vec![vec![Confusion::new(classes); rings]; regions] }
+        let regions = vec![vec![Confusion::new(classes); rings]; regions];
+        Self { regions, rays: RayCounts::new(classes), losses: LossSum::default() }
     }
 
     /// Adds the counts of another score of the same kind.
@@ -188,6 +260,8 @@ impl Score {
     /// If it is of another kind.
     pub fn merge(&mut self, other: &Score) {
         assert_eq!(self.regions.len(), other.regions.len(), "regions");
+        self.rays.merge(&other.rays);
+        self.losses.merge(&other.losses);
         for (own, other) in self.regions.iter_mut().zip(&other.regions) {
             assert_eq!(own.len(), other.len(), "rings");
             own.iter_mut().zip(other).for_each(|(own, other)| own.merge(other));
@@ -214,3 +288,6 @@ impl Score {
 pub fn write_text(path: &Path, text: &str) -> Result<()> {
     replace_file(path, |out| out.write_all(text.as_bytes()))
 }
+
+#[cfg(test)]
+mod tests;

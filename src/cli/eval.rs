@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use voxcast::dataset::{DataSet, Frame, Grid, Synthetic};
 use voxcast::eval::{Options, Prediction, Report, Score, Scorer, majority};
 use voxcast::rig::RigBuilder;
-use voxcast::{Error, Isa, Model, Result, Rig, Session, SessionOptions, Threads};
+use voxcast::{Error, Model, Occupancy, Result, Rig, Session, SessionOptions, Threads};
 
 /// Score a model on a data set with labels: IoU, mIoU and every class, near and far, seen and unseen.
 #[derive(Args, Debug)]
@@ -33,6 +33,9 @@ pub struct Eval {
     /// Frames that are computed at the same time, each with its own session. It does not change a result
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     workers: u16,
+    /// Also compute the four losses of the training, of level 0
+    #[arg(long, conflicts_with = "majority")]
+    losses: bool,
     /// Write all ratios and counts as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -144,7 +147,9 @@ impl Eval {
         let results: Mutex<Result<Vec<Option<Score>>>> = Mutex::new(Ok(vec![None; count]));
         let bar = terminal::progress("scoring", count);
         let work = || -> Result<()> {
-            let mut worker = Worker::new(predictor, isa, Threads::new(threads)?);
+            let threads = Threads::new(threads)?;
+            let options = SessionOptions { isa, threads, logits: self.losses, ..SessionOptions::default() };
+            let mut worker = Worker { predictor, options, running: None };
             loop {
                 let index = next.fetch_add(1, Ordering::Relaxed);
                 if index >= count {
@@ -190,16 +195,14 @@ struct Running {
     calibration: Vec<[f32; 16]>,
 }
 
-impl<'a> Worker<'a> {
-    fn new(predictor: &'a Predictor, isa: Isa, threads: Threads) -> Self {
-        Self { predictor, options: SessionOptions { isa, threads, ..SessionOptions::default() }, running: None }
-    }
-
+impl Worker<'_> {
     fn score(&mut self, set: &dyn DataSet, index: usize, scorer: &Scorer) -> Result<Score> {
         match self.predictor {
-            Predictor::Constant(classes) => scorer.score(&set.truth(index)?, &Prediction { classes, support: None }),
+            Predictor::Constant(classes) => {
+                scorer.score(&set.truth(index)?, &Prediction { classes, support: None, logits: None })
+            }
             Predictor::Model(model) => {
-                let Frame { scene, truth, .. } = set.frame(index)?;
+                let Frame { scene, truth } = set.frame(index)?;
                 let said = |e: Error| Error::new(e.kind(), format!("frame {}: {}", set.id(index), e.message()));
                 scene.check(model.network()).map_err(said)?;
                 let running = match &mut self.running {
@@ -208,7 +211,8 @@ impl<'a> Worker<'a> {
                 };
                 running.calibrate(&scene.lidar2img).map_err(said)?;
                 let result = running.session.run_scene(&scene).map_err(said)?;
-                scorer.score(&truth, &Prediction { classes: result.classes, support: Some(result.support) })
+                let Occupancy { classes, support, logits, .. } = result;
+                scorer.score(&truth, &Prediction { classes, support: Some(support), logits })
             }
         }
     }

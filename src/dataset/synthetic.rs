@@ -63,7 +63,8 @@ impl Synthetic {
         };
         let labels = voxels("labels")?;
         check_labels(&labels, CLASSES.len())?;
-        Ok(Truth { labels, masks: vec![voxels("visible")?] })
+        // The lidar is where the frame's metres begin.
+        Ok(Truth { labels, masks: vec![voxels("visible")?], origins: vec![[0.0; 3]] })
     }
 }
 
@@ -104,7 +105,7 @@ impl DataSet for Synthetic {
     fn frame(&self, index: usize) -> Result<Frame> {
         self.with_file(index, |file| {
             let scene = Scene::from_safetensors(file.bytes())?;
-            Ok(Frame { scene, truth: self.read_truth(file)?, origins: vec![[0.0; 3]] })
+            Ok(Frame { scene, truth: self.read_truth(file)? })
         })
     }
 

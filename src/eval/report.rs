@@ -1,5 +1,7 @@
 //! A total in words: text for a terminal, Markdown, JSON.
 
+use super::losses::Losses;
+use super::ray_iou::THRESHOLDS;
 use super::{Confusion, Score};
 use serde_json::{Value, json};
 
@@ -36,7 +38,7 @@ impl Report<'_> {
     /// The same tables as Markdown.
     pub fn markdown(&self) -> String {
         let tables: Vec<String> = self.tables().iter().map(Table::markdown).collect();
-        format!("{}, {} frames. Per cent.\n\n{}", self.title, self.frames, tables.join("\n"))
+        format!("{}, {} frames. IoU in per cent.\n\n{}", self.title, self.frames, tables.join("\n"))
     }
 
     /// All ratios and counts. Ratios are from 0 to 1; one that is 0 / 0 is null.
@@ -59,7 +61,27 @@ impl Report<'_> {
                 (name.to_owned(), value)
             })
             .collect();
-        json!({ "title": self.title, "frames": self.frames, "classes": self.classes, "regions": regions })
+        let rays = &self.total.rays;
+        let ray_classes: serde_json::Map<String, Value> = (1..self.classes.len())
+            .map(|c| (self.classes[c].to_owned(), json!([0, 1, 2].map(|t| rays.class_iou(t, c)))))
+            .collect();
+        let ray_means = [0, 1, 2].map(|t| rays.mean(t));
+        let losses = self.total.losses.mean().map(|Losses { focal, lovasz, geometric, semantic }| {
+            json!({ "focal": focal, "lovasz": lovasz, "geometric": geometric, "semantic": semantic })
+        });
+        json!({
+            "title": self.title,
+            "frames": self.frames,
+            "classes": self.classes,
+            "regions": regions,
+            "ray_iou": {
+                "mean": rays.ray_iou(),
+                "thresholds": THRESHOLDS,
+                "means": ray_means,
+                "classes": ray_classes,
+            },
+            "losses": losses,
+        })
     }
 
     fn ratios(&self, confusion: &Confusion) -> Value {
@@ -97,8 +119,25 @@ impl Report<'_> {
         names
     }
 
-    fn tables(&self) -> [Table; 3] {
-        [self.by_class(), self.by_ring("IoU", Confusion::iou), self.by_ring("mIoU", Confusion::mean_iou)]
+    fn tables(&self) -> Vec<Table> {
+        let iou = self.by_ring("IoU", Confusion::iou);
+        let mean = self.by_ring("mIoU", Confusion::mean_iou);
+        let mut tables = vec![self.by_class(), iou, mean, self.by_threshold()];
+        tables.extend(self.total.losses.mean().map(|losses| {
+            let values = [losses.focal, losses.lovasz, losses.geometric, losses.semantic];
+            let head = ["loss", "focal", "lovasz", "geometric", "semantic"].map(str::to_owned).to_vec();
+            let row = std::iter::once("level 0".to_owned()).chain(values.map(|value| format!("{value:.4}"))).collect();
+            Table { head, rows: vec![row] }
+        }));
+        tables
+    }
+
+    fn by_threshold(&self) -> Table {
+        let rays = &self.total.rays;
+        let thresholds = THRESHOLDS.map(|metres| format!("{metres} m"));
+        let head = ["RayIoU".to_owned(), "mean".to_owned()].into_iter().chain(thresholds).collect();
+        let means = [rays.ray_iou(), rays.mean(0), rays.mean(1), rays.mean(2)].map(percent);
+        Table { head, rows: vec![std::iter::once("all".to_owned()).chain(means).collect()] }
     }
 
     /// A column for each region; the share of the labelled voxels beside.
