@@ -3,6 +3,7 @@
 mod compare;
 mod demo;
 mod dump;
+mod eval;
 mod frame;
 mod import;
 mod inspect;
@@ -31,6 +32,7 @@ Examples:
   voxcast rig scene/ --model model.safetensors -o rig.safetensors
   voxcast run --model model.safetensors --rig rig.safetensors scene/ -o out.npz --png out.png
   voxcast inspect model.safetensors
+  voxcast eval --model model.safetensors --data synthetic:heldout
 
 A scene is a directory with calibration.json and its images, or a .safetensors file with `images` (u8 [N, H, W, 3], BGR)
 and `lidar2img` (f32 [N, 4, 4]).
@@ -57,6 +59,8 @@ enum Command {
     Selftest(selftest::SelfTest),
     /// Draw synthetic street scenes with labels
     Synth(synth::Synth),
+    /// Score a model on a data set with labels
+    Eval(eval::Eval),
 }
 
 impl Arguments {
@@ -71,6 +75,7 @@ impl Arguments {
             Command::Compare(command) => command.run(),
             Command::Selftest(command) => command.run(),
             Command::Synth(command) => command.run(),
+            Command::Eval(command) => command.run(),
         }
     }
 }

@@ -93,11 +93,12 @@ import(&checkpoint, &network, Options::default(), Path::new("model.safetensors")
 //!
 //! | feature | gives |
 //! |---|---|
-//! | `cli` (default) | the program `voxcast`, and the other three |
+//! | `cli` (default) | the program `voxcast`, and the others |
 //! | `import` | `checkpoint`: reading `.pth` and `.safetensors` |
 //! | `images` | `picture`, and JPEG and PNG in [`Scene::open`] and `Scene::save` |
 //! | `npz` | `npz`: NumPy's `.npz`, written and read |
 //! | `capi` | the functions of `include/voxcast.h`, for C; see `docs/embedding.md` |
+//! | `eval` | `dataset` and `eval`: frames with labels, and scores; with `images` and `npz` |
 //!
 //! Without features the library reads models, rigs and `.safetensors` scenes, and runs them.
 
@@ -110,9 +111,13 @@ mod capi;
 pub mod checkpoint;
 pub mod compare;
 pub mod container;
+#[cfg(feature = "eval")]
+pub mod dataset;
 pub mod demo;
 pub mod digest;
 pub mod error;
+#[cfg(feature = "eval")]
+pub mod eval;
 mod exec;
 pub mod graph;
 mod heap;

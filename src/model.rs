@@ -267,6 +267,19 @@ pub(crate) fn tensor<'a>(name: String, part: &Part, precision: Precision, data: 
     Tensor { name, dtype: dtype_of(part, precision), shape: vec![part.stored_len(precision)], data }
 }
 
+/// Writes the bytes of a model, such as one built into a program, to `path`, by way of a temporary file beside it.
+///
+/// # Errors
+/// [`ErrorKind::Io`] if the system refuses; [`ErrorKind::Format`] for bytes that are no model.
+pub fn write_bytes(path: &Path, bytes: &'static [u8]) -> Result<()> {
+    let model = Model::from_bytes(bytes)?;
+    let tensors = model.contents().map(|(name, dtype, shape, bytes)| {
+        let shape = shape.to_vec();
+        Tensor { name, dtype, shape, data: Data::Bytes(bytes) }
+    });
+    crate::container::write(path, tensors.collect(), model.metadata(), LAYOUT)
+}
+
 /// A model file's metadata.
 pub(crate) fn metadata(network: &Network, options: Options) -> BTreeMap<String, String> {
     let flag = |folded: bool| if folded { "folded" } else { "kept" }.to_owned();

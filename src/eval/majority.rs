@@ -1,0 +1,30 @@
+//! The image-blind baseline: what mostly stands in each voxel, whatever the cameras see.
+
+use crate::dataset::{DataSet, IGNORED};
+use crate::error::{Error, ErrorKind, Result};
+
+/// The class that most frames of `set` have in each voxel; of equally frequent ones the first. Voxels that no frame has a
+/// label for are empty. `done` is told how many frames were read.
+///
+/// # Errors
+/// Those of [`DataSet::truth`]; [`ErrorKind::TooLarge`] if there is no memory for a count per voxel and class.
+pub fn majority(set: &dyn DataSet, done: &mut dyn FnMut(usize)) -> Result<Vec<u8>> {
+    let (voxels, classes) = (set.grid().voxels(), set.classes().len());
+    let too_large =
+        || Error::new(ErrorKind::TooLarge, format!("no memory to count {classes} classes in {voxels} voxels"));
+    let length = voxels.checked_mul(classes).ok_or_else(too_large)?;
+    let mut counts: Vec<u32> = Vec::new();
+    counts.try_reserve_exact(length).map_err(|_| too_large())?;
+    counts.resize(length, 0);
+    for index in 0..set.len() {
+        let truth = set.truth(index)?;
+        for (counts, &label) in counts.chunks_exact_mut(classes).zip(&truth.labels) {
+            if label != IGNORED {
+                counts[usize::from(label)] += 1;
+            }
+        }
+        done(index + 1);
+    }
+    let first_largest = |counts: &[u32]| (0..classes).rev().max_by_key(|&class| counts[class]).unwrap_or(0);
+    Ok(counts.chunks_exact(classes).map(|counts| first_largest(counts) as u8).collect())
+}
