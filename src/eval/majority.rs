@@ -28,3 +28,50 @@ pub fn majority(set: &dyn DataSet, done: &mut dyn FnMut(usize)) -> Result<Vec<u8
     let first_largest = |counts: &[u32]| (0..classes).rev().max_by_key(|&class| counts[class]).unwrap_or(0);
     Ok(counts.chunks_exact(classes).map(|counts| first_largest(counts) as u8).collect())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::dataset::{Frame, Grid, Truth};
+
+    /// Labels of three frames of five voxels.
+    struct Three;
+
+    impl DataSet for Three {
+        fn classes(&self) -> &[&'static str] {
+            &["empty", "one", "two"]
+        }
+
+        fn grid(&self) -> Grid {
+            Grid { size: [5, 1, 1], bounds: [[0.0, 5.0], [0.0, 1.0], [0.0, 1.0]] }
+        }
+
+        fn masks(&self) -> &[&'static str] {
+            &[]
+        }
+
+        fn len(&self) -> usize {
+            3
+        }
+
+        fn id(&self, index: usize) -> &str {
+            ["a", "b", "c"][index]
+        }
+
+        fn frame(&self, _index: usize) -> Result<Frame> {
+            Err(Error::format("images are not needed"))
+        }
+
+        fn truth(&self, index: usize) -> Result<Truth> {
+            let labels = [[2, 1, 255, 255, 0], [2, 2, 255, 2, 1], [0, 255, 255, 255, 2]][index].to_vec();
+            Ok(Truth { labels, masks: vec![], origins: vec![] })
+        }
+    }
+
+    #[test]
+    fn most_frequent_and_first_of_equals() {
+        let mut read = vec![];
+        assert_eq!(majority(&Three, &mut |done| read.push(done)).expect("labels"), [2, 1, 0, 2, 0]);
+        assert_eq!(read, [1, 2, 3]);
+    }
+}
