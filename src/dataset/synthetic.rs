@@ -113,3 +113,6 @@ impl DataSet for Synthetic {
         self.with_file(index, |file| self.read_truth(file))
     }
 }
+
+#[cfg(test)]
+mod tests;
