@@ -282,7 +282,7 @@ fn the_demo_needs_no_other_file() {
     let file = |name: &str| format!("{directory}/{name}");
     let (model, scene, out) = (file("model.safetensors"), file("scene"), file("again.npz"));
     let again = done(&["run", "--model", &model, &scene, "-o", &out]);
-    assert!(again.contains(digest), "{again} {told}");
+    assert!(told.contains("mIoU") && again.contains(digest), "{again} {told}");
     assert_eq!(fs::read(file("occupancy.npz")).unwrap(), fs::read(&out).unwrap());
     assert!(fs::read(file("occupancy.png")).unwrap().starts_with(b"\x89PNG"));
 }
@@ -291,7 +291,7 @@ fn the_demo_needs_no_other_file() {
 fn help_and_usage() {
     assert!(done(&["--version"]).starts_with("voxcast "));
     let help = done(&["--help"]);
-    for command in ["demo", "import", "rig", "run", "inspect", "profile"] {
+    for command in ["compare", "demo", "eval", "import", "inspect", "profile", "rig", "run", "selftest", "synth"] {
         assert!(help.contains(command));
         assert!(done(&[command, "--help"]).contains("Examples:"), "{command}");
         assert!(done(&["help", command]).contains("Usage:"), "{command}");
@@ -675,7 +675,11 @@ fn sizes_beyond_memory_are_refused_before_they_are_taken() {
         let mut network = sound.clone();
         network[key] = value;
         fs::write(place.path("large.json"), network.to_string()).unwrap();
-        done(&words(&place.import("weights.pth", "large.json")));
+        // Import computes the self-test, which such a model cannot have.
+        let import = place.import("weights.pth", "large.json");
+        let line = refused(&place.text("out"), &words(&import));
+        assert!(line.contains(expected) && line.contains("--no-self-test"), "{line}");
+        done(&[&words(&import)[..], &["--no-self-test"]].concat());
         let [model, scene, out] = ["out", "scene", "out.npz"].map(|f| place.text(f));
         let output = bounded(&["inspect", &model, "--operations"]);
         assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
@@ -684,4 +688,67 @@ fn sizes_beyond_memory_are_refused_before_they_are_taken() {
         let line = refused(&model, &["run", "--model", &model, &scene, "-o", &out]);
         assert!(line.contains(expected), "{line}");
     }
+}
+
+#[test]
+fn an_imported_model_tests_the_machine() {
+    let place = Place::ready();
+    let model = place.text("model");
+    let told = done(&["selftest", &model, "--threads", "3"]);
+    assert!(told.contains("operations give what they must") && told.contains("3 threads"), "{told}");
+    let report: Value = serde_json::from_str(&done(&["selftest", &model, "--json", "--isa", "scalar"])).unwrap();
+    assert!(report["fault"].is_null() && report["operations"].as_u64().unwrap() > 100, "{report}");
+    let [network, weights, plain] = ["network.json", "weights.pth", "plain"].map(|f| place.text(f));
+    done(&["import", &weights, "--network", &network, "-o", &plain, "--no-self-test"]);
+    assert!(refused(&plain, &["selftest", &plain]).contains("no self-test"));
+}
+
+#[test]
+fn comparing_names_the_first_stage_that_differs() {
+    let place = Place::ready();
+    let [model, scene, out] = ["model", "scene", "out.npz"].map(|f| place.text(f));
+    let [first, second] = ["first", "second"].map(|f| place.text(f));
+    let run = |dump: &str, more: &[&str]| {
+        let arguments = [&["run", "--model", &model, &scene, "-o", &out, "--dump", dump][..], more].concat();
+        done(&arguments);
+    };
+    run(&first, &["--unfolded"]);
+    run(&second, &["--unfolded", "--threads", "3"]);
+    assert!(done(&["compare", &first, &second]).contains("agree"));
+    assert!(done(&["compare", "--model", &model, &scene, "--against-isa", "scalar"]).contains("agree"));
+    fs::remove_dir_all(place.path("second")).unwrap();
+    run(&second, &["--unfolded", "--mask", "1"]);
+    let output = voxcast(&["compare", &first, &second, "--common", "--json"]);
+    assert_eq!(output.status.code(), Some(1));
+    let table: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let stages = table["stages"].as_array().unwrap();
+    let named = stages.iter().find(|s| s["diverges"] == true).unwrap();
+    assert_eq!(table["first"], named["stage"], "{table}");
+    assert_eq!(voxcast(&["compare", &first]).status.code(), Some(2));
+    fs::write(place.path("no dump"), "no dump").unwrap();
+    refused("no dump", &["compare", &first, &place.text("no dump")]);
+}
+
+#[test]
+fn synthetic_scenes_run_and_sets_go_on() {
+    let place = Place::ready();
+    let mut street = network();
+    street.bounds = [[-20.0, 20.0], [-20.0, 20.0], [-5.3, 2.7]];
+    fs::write(place.path("street.json"), street.to_json()).unwrap();
+    let [network, drive, set] = ["street.json", "drive", "set"].map(|f| place.text(f));
+    done(&["synth", "--network", &network, "--seed", "5", "--frames", "2", "-o", &drive]);
+    let [model, scene, out] = ["model", "drive/001", "out.npz"].map(|f| place.text(f));
+    done(&["run", "--model", &model, &scene, "-o", &out]);
+    let arguments = ["synth", "--network", &network, "--seed", "5", "--count", "3", "--set", &set, "--pixels"];
+    done(&arguments);
+    let file = place.path("set/000000006.safetensors");
+    let whole = fs::read(&file).unwrap();
+    fs::remove_file(&file).unwrap();
+    done(&arguments);
+    assert!(fs::read(&file).unwrap() == whole, "the frame that was missing is made again");
+    done(&["run", "--model", &model, file.to_str().unwrap(), "-o", &out]);
+    let line = refused("set.json", &["synth", "--seed", "5", "--count", "3", "--set", &set]);
+    assert!(line.contains("other frames"), "{line}");
+    let seeds = ["synth", "--network", &network, "--seed", "999999999", "--count", "2", "--set", &set];
+    assert!(refused("", &seeds).contains("seeds below 1000000000"));
 }

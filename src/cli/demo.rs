@@ -33,7 +33,7 @@ pub struct Demo {
     #[arg(short, long, value_name = "DIR", default_value = "voxcast-demo")]
     output: PathBuf,
     /// Which street is drawn; the network was trained on 0 to 2419
-    #[arg(long, default_value_t = 1_000_011)]
+    #[arg(long, default_value_t = 1_000_006)]
     seed: u64,
     #[command(flatten)]
     machine: Machine,

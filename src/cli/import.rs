@@ -61,7 +61,12 @@ impl Import {
         .map_err(|e| e.in_file(&self.checkpoint))?;
         if !self.no_self_test {
             bar.set_message("self-test");
-            voxcast::selftest::record(&self.output, Isa::best(), &self.threads.threads()?)?;
+            let hint = |e: Error| {
+                let message =
+                    format!("the model is written, without its self-test: {} (see --no-self-test)", e.message());
+                Error::new(e.kind(), message).in_file(&self.output)
+            };
+            voxcast::selftest::record(&self.output, Isa::best(), &self.threads.threads()?).map_err(hint)?;
         }
         bar.finish_and_clear();
         let model = Model::open(&self.output)?;

@@ -2,7 +2,7 @@
 
 use super::{Machine, frame, import, terminal};
 use clap::Args;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 use voxcast::{Model, Network, Result};
 
@@ -38,7 +38,7 @@ impl BuildRig {
         let lidar2img = frame::calibration(&self.scene)?;
         let threads = self.machine.threads()?;
         let mut builder = voxcast::rig::RigBuilder::new(&network, lidar2img.len(), self.machine.isa()?)
-            .map_err(|e| e.in_file(&self.scene))?
+            .map_err(|e| e.in_file(self.source()))?
             .with_threads(threads.clone());
         let start = Instant::now();
         let rig = builder.build(&lidar2img).map_err(|e| e.in_file(&self.scene))?;
@@ -57,6 +57,12 @@ impl BuildRig {
         }
         println!("six matrices in {} on {} threads", terminal::time(elapsed), threads.count());
         Ok(())
+    }
+
+    /// Where the network stands.
+    fn source(&self) -> &Path {
+        let name = || Path::new(self.network.as_deref().unwrap_or_default());
+        self.model.as_deref().unwrap_or_else(name)
     }
 
     /// What `--model` or `--network` names; clap has seen to it that one of them is there.

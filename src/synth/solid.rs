@@ -127,7 +127,8 @@ impl Part {
         if let Some((distance, at)) = mantle.filter(|(d, _)| (start + step * d).abs() <= 1.0) {
             return Some(Hit { distance, normal: (at / self.half).normalize_or(Vec3::Z) });
         }
-        // Through one of the ends, where the slab was entered, if that lies in the circle.
+        // Through one of the ends, if the box is entered there and within the circle. A ray that enters the box beside the
+        // mantle and meets an end later passes: of a wheel that is a sliver at its rim.
         let at = from + along * near;
         let on_end = (start + step * near).abs() > 0.999;
         (near > 0.0 && near <= far && on_end && at.length_squared() <= 1.0).then(|| {
