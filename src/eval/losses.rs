@@ -22,7 +22,7 @@ pub struct Losses {
     pub semantic: f64,
 }
 
-/// The losses of `logits` [voxels, classes] for `labels` [voxels], over the voxels that are not [`IGNORED`]; zeros if all
+/// The losses of `logits`, `[voxels, classes]`, for `labels` (one per voxel), over the voxels that are not [`IGNORED`]; zeros if all
 /// are. `weights` are those of the focal loss, one per class, 1 by default.
 ///
 /// Takes 8 bytes per logit for the probabilities, and 16 per voxel to sort them.
