@@ -41,7 +41,7 @@ Exit codes: 0 done, 1 the input or the machine is at fault (one line on stderr),
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Run a small untrained network on a drawn scene; needs no other file
+    /// Run the network that ships with the program on a drawn street; needs no other file
     Demo(demo::Demo),
     /// Turn a training checkpoint into a model
     Import(import::Import),
@@ -106,7 +106,7 @@ impl ThreadCount {
 pub struct Machine {
     #[command(flatten)]
     threads: ThreadCount,
-    /// Instruction set: scalar (the specification, and slow), avx2 [default: the fastest of this CPU]
+    /// Instruction set: scalar (the specification, and slow), avx2, avx512 [default: the fastest of this CPU]
     #[arg(long, value_name = "NAME")]
     isa: Option<String>,
 }

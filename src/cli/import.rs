@@ -23,7 +23,7 @@ wants to call is refused by name.")]
 pub struct Import {
     /// mmengine .pth, or .safetensors with the same names
     checkpoint: PathBuf,
-    /// nuscenes-200, nuscenes-256, semantickitti-256, or a network.json
+    /// nuscenes-200, nuscenes-256, semantickitti-256, edge, or a network.json
     #[arg(long, value_name = "NAME|FILE.json")]
     network: String,
     /// How weights are stored; arithmetic is f32 either way
