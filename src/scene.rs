@@ -22,6 +22,13 @@ const MAX_CALIBRATION: u64 = 8 << 20;
 #[cfg(feature = "images")]
 const MAX_PIXELS_PER_BYTE: u64 = 8 * 1032;
 
+/// Name of the threads on which images are decoded.
+///
+/// A panic there is reported as an error of the file, but the process's panic hook has been called by then. A program
+/// that wants to say one thing only gives its hook an exception for this name.
+#[cfg(feature = "images")]
+pub const DECODER_THREAD: &str = "voxcast image decoder";
+
 /// The ego vehicle's forward direction in the lidar frame, as (x, y), judged by the bounds of the grid.
 ///
 /// A grid that starts at x = 0 and is symmetric in y lies ahead of a vehicle that drives along +x (SemanticKITTI). Any other
@@ -264,9 +271,24 @@ fn read_image(path: &Path, _camera: &Camera) -> Result<Image> {
     Err(Error::new(ErrorKind::Unsupported, message).in_file(path))
 }
 
-/// Decodes one image file as BGR, after its header has passed every check on size.
+/// Reads one image file as BGR.
+///
+/// Decoders of image formats are large, and some files make them panic rather than fail. A thread of its own keeps that
+/// from the caller, and its name, [`DECODER_THREAD`], tells a panic hook whose panic it is.
 #[cfg(feature = "images")]
 fn read_image(path: &Path, camera: &Camera) -> Result<Image> {
+    std::thread::scope(|scope| {
+        let builder = std::thread::Builder::new().name(DECODER_THREAD.into());
+        let thread = builder.spawn_scoped(scope, || decode_image(path, camera));
+        let thread = thread.map_err(|e| Error::io(path, "start a thread to decode", &e))?;
+        let panicked = |_| Error::format(format!("image of camera {}: its decoder gave up", camera.name)).in_file(path);
+        thread.join().map_err(panicked)?
+    })
+}
+
+/// Decodes one image file as BGR, after its header has passed every check on size.
+#[cfg(feature = "images")]
+fn decode_image(path: &Path, camera: &Camera) -> Result<Image> {
     use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
 
     let name = &camera.name;

@@ -173,6 +173,30 @@ mod directory {
         }
     }
 
+    /// A JPEG that is cut into blocks in a way that its decoder did not expect: progressive, with a third component
+    /// four times as wide as the second.
+    #[test]
+    fn decoder_that_panics_is_an_error_of_the_image() {
+        let dir = saved();
+        let scene = dir.path().join("deep/scene");
+        let path = scene.join("CAM_FRONT.png");
+        let mut bytes = Vec::new();
+        let pixels: Vec<u8> = (0..9 * 7 * 3).map(|i| (i * 37 % 251) as u8).collect();
+        let encoder = image::codecs::jpeg::JpegEncoder::new(&mut bytes);
+        image::ImageEncoder::write_image(encoder, &pixels, 9, 7, image::ExtendedColorType::Rgb8).unwrap();
+        let frame = bytes.windows(2).position(|marker| marker == [0xff, 0xc0]).unwrap();
+        bytes[frame + 1] = 0xc2;
+        for (component, sampling) in [0x21, 0x11, 0x42].into_iter().enumerate() {
+            bytes[frame + 11 + 3 * component] = sampling;
+        }
+        fs::write(&path, bytes).unwrap();
+        let text = fs::read_to_string(scene.join("calibration.json")).unwrap();
+        let text = text.replacen("\"width\":5", "\"width\":9", 1).replacen("\"height\":3", "\"height\":7", 1);
+        fs::write(scene.join("calibration.json"), text).unwrap();
+        let error = Scene::open(&scene).unwrap_err();
+        assert!(error.path() == Some(&path) && error.message().contains("CAM_FRONT"), "{error}");
+    }
+
     fn crc32(bytes: &[u8]) -> u32 {
         !bytes.iter().fold(!0u32, |crc, &b| {
             (0..8).fold(crc ^ u32::from(b), |c, _| if c & 1 == 1 { (c >> 1) ^ 0xedb8_8320 } else { c >> 1 })
