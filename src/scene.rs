@@ -1,6 +1,6 @@
 //! A scene: one set of camera images with their calibration.
 
-use crate::camera::{Camera, read_calibration};
+use crate::camera::read_calibration;
 use crate::error::{Error, ErrorKind, Result};
 use crate::network::Network;
 use safetensors::{Dtype, SafeTensors};
@@ -140,7 +140,8 @@ impl Scene {
                     format!("camera {}: file {:?}, expected a path inside the scene", camera.name, camera.file);
                 return Err(Error::format(message).in_file(&path));
             }
-            scene.images.push(read_image(&directory.join(file), &camera)?);
+            let size = Some([camera.height, camera.width]);
+            scene.images.push(read_image(&directory.join(file), &camera.name, size)?);
             scene.names.push(camera.name);
             scene.lidar2img.push(camera.lidar2img);
         }
@@ -247,7 +248,7 @@ fn check_side(camera: &str, height: usize, width: usize) -> Result<()> {
     Ok(())
 }
 
-fn check_finite(camera: &str, matrix: &[f32; 16]) -> Result<()> {
+pub(crate) fn check_finite(camera: &str, matrix: &[f32; 16]) -> Result<()> {
     match matrix.iter().position(|v| !v.is_finite()) {
         None => Ok(()),
         Some(i) => {
@@ -259,17 +260,17 @@ fn check_finite(camera: &str, matrix: &[f32; 16]) -> Result<()> {
 }
 
 #[cfg(not(feature = "images"))]
-fn read_image(path: &Path, _camera: &Camera) -> Result<Image> {
+fn read_image(path: &Path, _camera: &str, _size: Option<[usize; 2]>) -> Result<Image> {
     let message = "this build reads no image files (feature \"images\"), expected a .safetensors scene";
     Err(Error::new(ErrorKind::Unsupported, message).in_file(path))
 }
 
-/// Decodes one image file as BGR, after its header has passed every check on size.
+/// Decodes the image file of camera `name` as BGR, after its header has passed every check on size. `size` is the height and
+/// width that the calibration says, where it does.
 #[cfg(feature = "images")]
-fn read_image(path: &Path, camera: &Camera) -> Result<Image> {
+pub(crate) fn read_image(path: &Path, name: &str, size: Option<[usize; 2]>) -> Result<Image> {
     use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
 
-    let name = &camera.name;
     let missing = |doing: &str, e: &std::io::Error| {
         let e = std::io::Error::new(e.kind(), format!("{e} (image of camera {name})"));
         Error::io(path, doing, &e)
@@ -289,8 +290,7 @@ fn read_image(path: &Path, camera: &Camera) -> Result<Image> {
     let (width, height) = decoder.dimensions();
     let (width, height) = (width as usize, height as usize);
     check_side(name, height, width).map_err(|e| e.in_file(path))?;
-    let [h, w] = [camera.height, camera.width];
-    if [h, w] != [height, width] {
+    if let Some([h, w]) = size.filter(|&size| size != [height, width]) {
         let message =
             format!("camera {name}: image of {height}x{width}, the calibration expects {h}x{w} (height x width)");
         return Err(Error::mismatch(message).in_file(path));
