@@ -11,6 +11,7 @@ mod profile;
 mod rig;
 mod run;
 mod selftest;
+mod source;
 mod synth;
 mod terminal;
 

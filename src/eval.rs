@@ -6,7 +6,7 @@
 //!
 //! Truth is never changed to suit a network. Where its voxels are not the network's, each labelled voxel is compared with
 //! the predicted voxel that contains its centre; where there is none, the network has said nothing, and it counts as
-//! predicted empty.
+//! predicted empty. Networks predict in the lidar frame; labels with other axes are led there by [`Truth::grid_to_lidar`].
 
 mod confusion;
 pub mod losses;
@@ -18,7 +18,7 @@ pub use confusion::Confusion;
 pub use majority::majority;
 pub use report::Report;
 
-use crate::dataset::{Grid, IGNORED, Truth};
+use crate::dataset::{Axes, Grid, IGNORED, Pose, Truth};
 use crate::error::{Error, Result};
 use crate::replace::replace_file;
 use losses::{Losses, losses};
@@ -59,12 +59,23 @@ pub struct Scorer {
     truth: Grid,
     prediction: Grid,
     masks: usize,
-    rings: usize,
+    /// Ends of the rings in metres.
+    ends: Vec<f64>,
     directions: Vec<[f64; 3]>,
-    /// Ring of each column (x, y) of the truth.
+    /// Ring of each column (x, y) of the truth, if its axes are the lidar's.
     ring_of: Vec<u8>,
-    /// For each axis and index of the truth, the index in the prediction; none where the two grids are one.
-    nearest: Option<[Vec<Option<usize>>; 3]>,
+    correspondence: Correspondence,
+}
+
+/// How voxels of the truth are found in the prediction.
+#[derive(Clone, Debug)]
+enum Correspondence {
+    /// The two grids are one.
+    Same,
+    /// For each axis and index of the truth, the index in the prediction.
+    Indices([Vec<Option<usize>>; 3]),
+    /// By the pose of each frame, from the truth's axes to the lidar's.
+    Posed,
 }
 
 impl Scorer {
@@ -72,7 +83,9 @@ impl Scorer {
     /// `prediction`.
     ///
     /// # Errors
-    /// [`ErrorKind::Format`](crate::ErrorKind::Format) for rings that are not ascending, positive and fewer than 255.
+    /// [`ErrorKind::Format`](crate::ErrorKind::Format) for rings that are not ascending, positive and fewer than 255;
+    /// [`ErrorKind::Mismatch`](crate::ErrorKind::Mismatch) for a prediction with axes of the ego vehicle where the truth has
+    /// not.
     pub fn new(classes: usize, masks: usize, truth: Grid, prediction: Grid, options: &Options) -> Result<Self> {
         let rings = &options.rings;
         let ascending = rings.windows(2).all(|pair| pair[0] < pair[1]);
@@ -83,14 +96,21 @@ impl Scorer {
         let mut ring_of = Vec::with_capacity(nx * ny);
         for x in 0..nx {
             for y in 0..ny {
-                let (x, y) = (truth.centre(0, x), truth.centre(1, y));
-                let distance = (x * x + y * y).sqrt();
-                ring_of.push(rings.iter().position(|&end| distance < end).unwrap_or(rings.len()) as u8);
+                ring_of.push(ring(rings, truth.centre(0, x), truth.centre(1, y)) as u8);
             }
         }
-        let nearest = (truth != prediction).then(|| [0, 1, 2].map(|axis| nearest(&truth, &prediction, axis)));
-        let directions = ray_iou::directions();
-        Ok(Self { classes, truth, prediction, masks, rings: rings.len() + 1, directions, ring_of, nearest })
+        let correspondence = match (truth.axes, prediction.axes) {
+            _ if truth == prediction => Correspondence::Same,
+            (Axes::Ego, Axes::Lidar) => Correspondence::Posed,
+            (Axes::Lidar, Axes::Ego) => {
+                let message =
+                    "a prediction with axes of the ego vehicle, expected those of the lidar, as the labels have";
+                return Err(Error::mismatch(message));
+            }
+            _ => Correspondence::Indices([0, 1, 2].map(|axis| nearest(&truth, &prediction, axis))),
+        };
+        let (ends, directions) = (rings.clone(), ray_iou::directions());
+        Ok(Self { classes, truth, prediction, masks, ends, directions, ring_of, correspondence })
     }
 
     /// Names of the regions that scores are told apart by: "all" voxels, those of each mask, and those that the rig
@@ -106,8 +126,9 @@ impl Scorer {
     /// grids, or classes beyond its own.
     pub fn score(&self, truth: &Truth, prediction: &Prediction<'_>) -> Result<Score> {
         self.check(truth, prediction)?;
-        let mut score = Score::new(self.classes, self.masks + 2, self.rings);
-        let resampled = self.resampled(prediction.classes);
+        let mut score = Score::new(self.classes, self.masks + 2, self.ends.len() + 1);
+        let pose = &truth.grid_to_lidar;
+        let resampled = self.resampled(pose, prediction.classes);
         let (grid, classes) = (&self.truth, self.classes);
         score.rays = count_rays(grid, classes, &truth.labels, &resampled, &truth.origins, &self.directions);
         if let Some(logits) = prediction.logits {
@@ -115,14 +136,17 @@ impl Scorer {
         }
         let [nx, ny, nz] = self.truth.size;
         let columns = (0..nx).flat_map(|x| (0..ny).map(move |y| [x, y]));
-        for (([x, y], &ring), first) in columns.zip(&self.ring_of).zip((0..).step_by(nz)) {
-            let ring = usize::from(ring);
+        for (([x, y], &column_ring), first) in columns.zip(&self.ring_of).zip((0..).step_by(nz)) {
             for z in 0..nz {
                 let label = truth.labels[first + z];
                 if label == IGNORED {
                     continue;
                 }
-                let at = self.predicted_voxel([x, y, z]);
+                let ring = match grid.axes {
+                    Axes::Lidar => usize::from(column_ring),
+                    Axes::Ego => self.ring_at(pose, [x, y, z]),
+                };
+                let at = self.predicted_voxel(pose, [x, y, z]);
                 let class = resampled[first + z];
                 score.regions[0][ring].add(label, class);
                 for (mask, region) in truth.masks.iter().zip(1..) {
@@ -139,20 +163,36 @@ impl Scorer {
     }
 
     /// The prediction on the grid of the truth.
-    fn resampled<'a>(&self, classes: &'a [u8]) -> Cow<'a, [u8]> {
-        if self.nearest.is_none() {
+    fn resampled<'a>(&self, pose: &Pose, classes: &'a [u8]) -> Cow<'a, [u8]> {
+        if self.truth == self.prediction {
             return Cow::Borrowed(classes);
         }
         let [nx, ny, nz] = self.truth.size;
         let voxels = (0..nx).flat_map(|x| (0..ny).flat_map(move |y| (0..nz).map(move |z| [x, y, z])));
-        Cow::Owned(voxels.map(|voxel| self.predicted_voxel(voxel).map_or(0, |at| classes[at])).collect())
+        Cow::Owned(voxels.map(|voxel| self.predicted_voxel(pose, voxel).map_or(0, |at| classes[at])).collect())
+    }
+
+    /// Centre of voxel `voxel` of the truth in the lidar frame.
+    fn centre(&self, pose: &Pose, voxel: [usize; 3]) -> [f64; 3] {
+        pose.apply([0, 1, 2].map(|axis| self.truth.centre(axis, voxel[axis])))
+    }
+
+    /// Ring of a voxel of the truth, whose axes are not the lidar's.
+    fn ring_at(&self, pose: &Pose, voxel: [usize; 3]) -> usize {
+        let [x, y, _] = self.centre(pose, voxel);
+        ring(&self.ends, x, y)
     }
 
     /// Where the prediction speaks of voxel `[x, y, z]` of the truth; nowhere if that lies outside its grid.
-    fn predicted_voxel(&self, [x, y, z]: [usize; 3]) -> Option<usize> {
-        let [x, y, z] = match &self.nearest {
-            None => [x, y, z],
-            Some([along_x, along_y, along_z]) => [along_x[x]?, along_y[y]?, along_z[z]?],
+    fn predicted_voxel(&self, pose: &Pose, [x, y, z]: [usize; 3]) -> Option<usize> {
+        let [x, y, z] = match &self.correspondence {
+            Correspondence::Same => [x, y, z],
+            Correspondence::Indices([along_x, along_y, along_z]) => [along_x[x]?, along_y[y]?, along_z[z]?],
+            Correspondence::Posed => {
+                let centre = self.centre(pose, [x, y, z]);
+                let index = |axis: usize| self.prediction.index(axis, centre[axis]);
+                [index(0)?, index(1)?, index(2)?]
+            }
         };
         let [_, ny, nz] = self.prediction.size;
         Some((x * ny + y) * nz + z)
@@ -174,7 +214,7 @@ impl Scorer {
         check("predicted voxels", prediction.classes.len(), predicted)?;
         check("voxels with support", prediction.support.map_or(predicted, <[u16]>::len), predicted)?;
         if let Some(logits) = prediction.logits {
-            if self.nearest.is_some() {
+            if self.truth != self.prediction {
                 let message = "losses need labels on the grid of the network, which these are not";
                 return Err(Error::mismatch(message));
             }
@@ -191,12 +231,13 @@ impl Scorer {
 
 /// For each index along `axis` of `truth`, the index in `prediction` whose voxel contains the centre.
 fn nearest(truth: &Grid, prediction: &Grid, axis: usize) -> Vec<Option<usize>> {
-    let low = f64::from(prediction.bounds[axis][0]);
-    let index = |centre: f64| {
-        let index = ((centre - low) / prediction.edge(axis)).floor();
-        (index >= 0.0 && index < prediction.size[axis] as f64).then_some(index as usize)
-    };
-    (0..truth.size[axis]).map(|i| index(truth.centre(axis, i))).collect()
+    (0..truth.size[axis]).map(|i| prediction.index(axis, truth.centre(axis, i))).collect()
+}
+
+/// The ring of a place in the lidar frame, of those that end at `ends`.
+fn ring(ends: &[f64], x: f64, y: f64) -> usize {
+    let distance = (x * x + y * y).sqrt();
+    ends.iter().position(|&end| distance < end).unwrap_or(ends.len())
 }
 
 /// The score of a frame, or of many: a confusion for each region and ring.

@@ -210,23 +210,8 @@ fn read_from(reader: impl Read + Seek, length: u64) -> Result<Vec<OwnedArray>> {
 }
 
 fn read_array(entry: &mut impl Read, size: u64) -> Result<(Vec<usize>, OwnedElements)> {
-    let failed = |e: io::Error| Error::format(format!("cannot be read: {e}"));
-    let mut start = [0u8; 8];
-    entry.read_exact(&mut start).map_err(failed)?;
-    if &start[..6] != b"\x93NUMPY" || !(1..=3).contains(&start[6]) {
-        return Err(Error::format(format!("starts with {start:02x?}, expected \\x93NUMPY and version 1 to 3")));
-    }
-    let wide = if start[6] == 1 { 2 } else { 4 };
-    let mut length = [0u8; 4];
-    entry.read_exact(&mut length[..wide]).map_err(failed)?;
-    let length = u64::from(u32::from_le_bytes(length));
-    if length > 1 << 16 {
-        return Err(Error::format(format!("header of {length} bytes, expected at most 65536")));
-    }
-    let mut literal = Vec::new();
-    entry.take(length).read_to_end(&mut literal).map_err(failed)?;
-    let literal = std::str::from_utf8(&literal).map_err(|_| Error::format("header is not text"))?;
-    let (descr, shape) = parse_header(literal)?;
+    let (literal, header) = read_header(entry)?;
+    let (descr, shape) = parse_header(&literal)?;
     let item = match descr {
         "|u1" | "u1" | "<u1" | "|b1" => 1,
         "<u2" => 2,
@@ -236,23 +221,96 @@ fn read_array(entry: &mut impl Read, size: u64) -> Result<(Vec<usize>, OwnedElem
             return Err(Error::new(ErrorKind::Unsupported, message));
         }
     };
-    let expected = product(&shape).and_then(|n| n.checked_mul(item)).map(|n| n as u64);
-    let header = 8 + wide as u64 + length;
-    if expected.is_none_or(|n| Some(header) != size.checked_sub(n)) {
-        return Err(Error::format(format!("{size} bytes, expected shape {shape:?} of {item} bytes each")));
-    }
-    // One byte more than expected is asked for, so that the end of the entry is seen and its checksum compared.
-    let mut bytes = Vec::new();
-    entry.take(size - header + 1).read_to_end(&mut bytes).map_err(failed)?;
-    if bytes.len() as u64 != size - header {
-        return Err(Error::format(format!("{} bytes of elements, expected {}", bytes.len(), size - header)));
-    }
+    let bytes = read_elements(entry, &shape, item, header, size)?;
     let elements = match item {
         1 => OwnedElements::U8(bytes),
         2 => OwnedElements::U16(bytes.as_chunks().0.iter().map(|&b| u16::from_le_bytes(b)).collect()),
         _ => OwnedElements::F32(bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()),
     };
     Ok((shape, elements))
+}
+
+/// The literal at the start of an `.npy`, and the bytes up to the elements.
+fn read_header(entry: &mut impl Read) -> Result<(String, u64)> {
+    let mut start = [0u8; 8];
+    entry.read_exact(&mut start).map_err(unreadable)?;
+    if &start[..6] != b"\x93NUMPY" || !(1..=3).contains(&start[6]) {
+        return Err(Error::format(format!("starts with {start:02x?}, expected \\x93NUMPY and version 1 to 3")));
+    }
+    let wide = if start[6] == 1 { 2 } else { 4 };
+    let mut length = [0u8; 4];
+    entry.read_exact(&mut length[..wide]).map_err(unreadable)?;
+    let length = u64::from(u32::from_le_bytes(length));
+    if length > 1 << 16 {
+        return Err(Error::format(format!("header of {length} bytes, expected at most 65536")));
+    }
+    let mut literal = Vec::new();
+    entry.take(length).read_to_end(&mut literal).map_err(unreadable)?;
+    let literal = String::from_utf8(literal).map_err(|_| Error::format("header is not text"))?;
+    Ok((literal, 8 + wide as u64 + length))
+}
+
+/// The elements of `item` bytes behind a header of `header` bytes, in an entry of `size`.
+fn read_elements(entry: &mut impl Read, shape: &[usize], item: usize, header: u64, size: u64) -> Result<Vec<u8>> {
+    let expected = product(shape).and_then(|n| n.checked_mul(item)).map(|n| n as u64);
+    if expected.is_none_or(|n| Some(header) != size.checked_sub(n)) {
+        return Err(Error::format(format!("{size} bytes, expected shape {shape:?} of {item} bytes each")));
+    }
+    // One byte more than expected is asked for, so that the end of the entry is seen and its checksum compared.
+    let mut bytes = Vec::new();
+    entry.take(size - header + 1).read_to_end(&mut bytes).map_err(unreadable)?;
+    if bytes.len() as u64 != size - header {
+        return Err(Error::format(format!("{} bytes of elements, expected {}", bytes.len(), size - header)));
+    }
+    Ok(bytes)
+}
+
+fn unreadable(e: io::Error) -> Error {
+    Error::format(format!("cannot be read: {e}"))
+}
+
+/// Reads the shape and the elements of the `.npy` at `path`, of any integer type of up to 64 bits, little endian and in C
+/// order.
+///
+/// # Errors
+/// [`ErrorKind::Io`] when the file cannot be opened; [`ErrorKind::Format`] when it is no `.npy`, its shape and its length
+/// disagree, or an element exceeds an `i64`; [`ErrorKind::Unsupported`] for elements that are no such integers and for
+/// Fortran order.
+pub fn read_npy_integers(path: &Path) -> Result<(Vec<usize>, Vec<i64>)> {
+    let file = File::open(path).map_err(|e| Error::io(path, "open", &e))?;
+    let length = file.metadata().map_err(|e| Error::io(path, "read", &e))?.len();
+    read_integers(&mut BufReader::new(file), length).map_err(|e| e.in_file(path))
+}
+
+fn read_integers(file: &mut impl Read, size: u64) -> Result<(Vec<usize>, Vec<i64>)> {
+    let (literal, header) = read_header(file)?;
+    let (descr, shape) = parse_header(&literal)?;
+    let unsupported = || {
+        let message = format!("elements of type {descr:?}, expected little-endian integers such as \"<i8\"");
+        Error::new(ErrorKind::Unsupported, message)
+    };
+    let (order, kind) = descr.split_at_checked(1).ok_or_else(unsupported)?;
+    let signed = kind.starts_with('i');
+    let item = match kind {
+        "i1" | "u1" if "|<".contains(order) => 1,
+        "i2" | "u2" if order == "<" => 2,
+        "i4" | "u4" if order == "<" => 4,
+        "i8" | "u8" if order == "<" => 8,
+        _ => return Err(unsupported()),
+    };
+    let bytes = read_elements(file, &shape, item, header, size)?;
+    let integer = |bytes: &[u8]| {
+        let negative = signed && bytes[item - 1] >= 0x80;
+        let mut wide = [if negative { 0xff } else { 0 }; 8];
+        wide[..item].copy_from_slice(bytes);
+        let number = i64::from_le_bytes(wide);
+        if !signed && number < 0 {
+            return Err(Error::format(format!("element {}, expected at most {}", number as u64, i64::MAX)));
+        }
+        Ok(number)
+    };
+    let integers = bytes.chunks_exact(item).map(integer).collect::<Result<_>>()?;
+    Ok((shape, integers))
 }
 
 /// The element type and shape of a header such as `{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }`.

@@ -1,6 +1,6 @@
 //! A scene: one set of camera images with their calibration.
 
-use crate::camera::{Camera, read_calibration};
+use crate::camera::read_calibration;
 use crate::error::{Error, ErrorKind, Result};
 use crate::network::Network;
 use safetensors::{Dtype, SafeTensors};
@@ -147,7 +147,8 @@ impl Scene {
                     format!("camera {}: file {:?}, expected a path inside the scene", camera.name, camera.file);
                 return Err(Error::format(message).in_file(&path));
             }
-            scene.images.push(read_image(&directory.join(file), &camera)?);
+            let size = Some([camera.height, camera.width]);
+            scene.images.push(read_image(&directory.join(file), &camera.name, size)?);
             scene.names.push(camera.name);
             scene.lidar2img.push(camera.lidar2img);
         }
@@ -254,7 +255,7 @@ fn check_side(camera: &str, height: usize, width: usize) -> Result<()> {
     Ok(())
 }
 
-fn check_finite(camera: &str, matrix: &[f32; 16]) -> Result<()> {
+pub(crate) fn check_finite(camera: &str, matrix: &[f32; 16]) -> Result<()> {
     match matrix.iter().position(|v| !v.is_finite()) {
         None => Ok(()),
         Some(i) => {
@@ -266,32 +267,31 @@ fn check_finite(camera: &str, matrix: &[f32; 16]) -> Result<()> {
 }
 
 #[cfg(not(feature = "images"))]
-fn read_image(path: &Path, _camera: &Camera) -> Result<Image> {
+fn read_image(path: &Path, _camera: &str, _size: Option<[usize; 2]>) -> Result<Image> {
     let message = "this build reads no image files (feature \"images\"), expected a .safetensors scene";
     Err(Error::new(ErrorKind::Unsupported, message).in_file(path))
 }
 
-/// Reads one image file as BGR.
+/// Reads the image file of camera `name` as BGR. `size` is the height and width that the calibration says, where it does.
 ///
 /// Decoders of image formats are large, and some files make them panic rather than fail. A thread of its own keeps that
 /// from the caller, and its name, [`DECODER_THREAD`], tells a panic hook whose panic it is.
 #[cfg(feature = "images")]
-fn read_image(path: &Path, camera: &Camera) -> Result<Image> {
+pub(crate) fn read_image(path: &Path, name: &str, size: Option<[usize; 2]>) -> Result<Image> {
     std::thread::scope(|scope| {
         let builder = std::thread::Builder::new().name(DECODER_THREAD.into());
-        let thread = builder.spawn_scoped(scope, || decode_image(path, camera));
+        let thread = builder.spawn_scoped(scope, || decode_image(path, name, size));
         let thread = thread.map_err(|e| Error::io(path, "start a thread to decode", &e))?;
-        let panicked = |_| Error::format(format!("image of camera {}: its decoder gave up", camera.name)).in_file(path);
+        let panicked = |_| Error::format(format!("image of camera {name}: its decoder gave up")).in_file(path);
         thread.join().map_err(panicked)?
     })
 }
 
-/// Decodes one image file as BGR, after its header has passed every check on size.
+/// Decodes an image, after its header has passed every check on size.
 #[cfg(feature = "images")]
-fn decode_image(path: &Path, camera: &Camera) -> Result<Image> {
+fn decode_image(path: &Path, name: &str, size: Option<[usize; 2]>) -> Result<Image> {
     use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
 
-    let name = &camera.name;
     let missing = |doing: &str, e: &std::io::Error| {
         let e = std::io::Error::new(e.kind(), format!("{e} (image of camera {name})"));
         Error::io(path, doing, &e)
@@ -311,8 +311,7 @@ fn decode_image(path: &Path, camera: &Camera) -> Result<Image> {
     let (width, height) = decoder.dimensions();
     let (width, height) = (width as usize, height as usize);
     check_side(name, height, width).map_err(|e| e.in_file(path))?;
-    let [h, w] = [camera.height, camera.width];
-    if [h, w] != [height, width] {
+    if let Some([h, w]) = size.filter(|&size| size != [height, width]) {
         let message =
             format!("camera {name}: image of {height}x{width}, the calibration expects {h}x{w} (height x width)");
         return Err(Error::mismatch(message).in_file(path));

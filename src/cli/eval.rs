@@ -1,22 +1,27 @@
 //! `voxcast eval`
 
+use super::source::{FORMS, Source};
 use super::{Machine, frame, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
-use voxcast::dataset::{DataSet, Frame, Grid, Synthetic};
+use voxcast::dataset::{DataSet, Frame, Grid};
 use voxcast::eval::{Options, Prediction, Report, Score, Scorer, majority};
 use voxcast::rig::RigBuilder;
 use voxcast::{Error, Model, Occupancy, Result, Rig, Session, SessionOptions, Threads};
 
 /// Score a model on a data set with labels: IoU, mIoU and every class, near and far, seen and unseen.
 #[derive(Args, Debug)]
-#[command(after_help = "\
+#[command(after_help = format!("\
 Examples:
   voxcast eval --model model.safetensors --data synthetic:heldout
   voxcast eval --model model.safetensors --data synthetic:heldout --json scores.json --markdown scores.md
-  voxcast eval --majority synthetic:train --data synthetic:heldout    # what can be said without looking")]
+  voxcast eval --majority synthetic:train --data synthetic:heldout    # what can be said without looking
+  voxcast eval --model model.safetensors --data surroundocc:nuscenes:nuscenes_occ:val
+  voxcast eval --model model.safetensors --data semantickitti:kitti:08
+
+{FORMS}"))]
 pub struct Eval {
     /// The model
     #[arg(long, required_unless_present = "majority", conflicts_with = "majority")]
@@ -24,7 +29,7 @@ pub struct Eval {
     /// Instead of a model, predict in each voxel the class that is most frequent there in another set
     #[arg(long, value_name = "SET")]
     majority: Option<Source>,
-    /// The data set: synthetic:DIR
+    /// The data set, as below: synthetic:DIR, surroundocc:..., occ3d:... or semantickitti:...
     #[arg(long, value_name = "SET")]
     data: Source,
     /// Only the first N frames
@@ -44,35 +49,6 @@ pub struct Eval {
     markdown: Option<PathBuf>,
     #[command(flatten)]
     machine: Machine,
-}
-
-/// A data set as it is named on the command line.
-#[derive(Clone, Debug)]
-struct Source {
-    directory: PathBuf,
-}
-
-impl std::str::FromStr for Source {
-    type Err = String;
-
-    fn from_str(text: &str) -> std::result::Result<Self, String> {
-        match text.split_once(':') {
-            Some(("synthetic", directory)) => Ok(Self { directory: directory.into() }),
-            _ => Err("expected synthetic:DIR".to_owned()),
-        }
-    }
-}
-
-impl std::fmt::Display for Source {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "synthetic:{}", self.directory.display())
-    }
-}
-
-impl Source {
-    fn open(&self) -> Result<Box<dyn DataSet>> {
-        Ok(Box::new(Synthetic::open(&self.directory)?))
-    }
 }
 
 /// Who predicts.

@@ -1,6 +1,6 @@
 //! Sets that `voxcast synth --set` wrote: `set.json`, and a `.safetensors` per seed.
 
-use super::{DataSet, Frame, Grid, Truth, check_labels};
+use super::{DataSet, Frame, Grid, Pose, Truth, check_labels};
 use crate::container::Container;
 use crate::error::{Error, Result};
 use crate::network::Network;
@@ -64,7 +64,8 @@ impl Synthetic {
         let labels = voxels("labels")?;
         check_labels(&labels, CLASSES.len())?;
         // The lidar is where the frame's metres begin.
-        Ok(Truth { labels, masks: vec![voxels("visible")?], origins: vec![[0.0; 3]] })
+        let masks = vec![voxels("visible")?];
+        Ok(Truth { labels, masks, origins: vec![[0.0; 3]], grid_to_lidar: Pose::IDENTITY })
     }
 }
 

@@ -4,7 +4,7 @@ use crate::dataset::{DataSet, IGNORED};
 use crate::error::{Error, ErrorKind, Result};
 
 /// The class that most frames of `set` have in each voxel; of equally frequent ones the first. Voxels that no frame has a
-/// label for are empty. `done` is told how many frames were read.
+/// label for are empty. The voxels are those of `set`'s grid, with its axes. `done` is told how many frames were read.
 ///
 /// # Errors
 /// Those of [`DataSet::truth`]; [`ErrorKind::TooLarge`] if there is no memory for a count per voxel and class.
@@ -32,7 +32,7 @@ pub fn majority(set: &dyn DataSet, done: &mut dyn FnMut(usize)) -> Result<Vec<u8
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::{Frame, Grid, Truth};
+    use crate::dataset::{Axes, Frame, Grid, Pose, Truth};
 
     /// Labels of three frames of five voxels.
     struct Three;
@@ -43,7 +43,7 @@ mod tests {
         }
 
         fn grid(&self) -> Grid {
-            Grid { size: [5, 1, 1], bounds: [[0.0, 5.0], [0.0, 1.0], [0.0, 1.0]] }
+            Grid { size: [5, 1, 1], bounds: [[0.0, 5.0], [0.0, 1.0], [0.0, 1.0]], axes: Axes::Lidar }
         }
 
         fn masks(&self) -> &[&'static str] {
@@ -64,7 +64,7 @@ mod tests {
 
         fn truth(&self, index: usize) -> Result<Truth> {
             let labels = [[2, 1, 255, 255, 0], [2, 2, 255, 2, 1], [0, 255, 255, 255, 2]][index].to_vec();
-            Ok(Truth { labels, masks: vec![], origins: vec![] })
+            Ok(Truth { labels, masks: vec![], origins: vec![], grid_to_lidar: Pose::IDENTITY })
         }
     }
 

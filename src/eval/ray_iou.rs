@@ -155,8 +155,9 @@ fn first_hit(grid: &Grid, classes: &[u8], origin: &[f64; 3], direction: &[f64; 3
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::dataset::Axes;
 
-    const GRID: Grid = Grid { size: [8, 4, 2], bounds: [[0.0, 8.0], [-2.0, 2.0], [-1.0, 1.0]] };
+    const GRID: Grid = Grid { size: [8, 4, 2], bounds: [[0.0, 8.0], [-2.0, 2.0], [-1.0, 1.0]], axes: Axes::Lidar };
 
     fn at([x, y, z]: [usize; 3]) -> usize {
         (x * 4 + y) * 2 + z

@@ -1,10 +1,11 @@
 use super::*;
+use crate::dataset::{Axes, Pose};
 
-const TRUTH: Grid = Grid { size: [4, 4, 2], bounds: [[-4.0, 4.0], [-4.0, 4.0], [-1.0, 1.0]] };
+const TRUTH: Grid = Grid { size: [4, 4, 2], bounds: [[-4.0, 4.0], [-4.0, 4.0], [-1.0, 1.0]], axes: Axes::Lidar };
 
 fn truth(labels: Vec<u8>) -> Truth {
     let mask = (0..labels.len()).map(|i| u8::from(i % 3 == 0)).collect();
-    Truth { labels, masks: vec![mask], origins: vec![[0.1, 0.2, 0.3]] }
+    Truth { labels, masks: vec![mask], origins: vec![[0.1, 0.2, 0.3]], grid_to_lidar: Pose::IDENTITY }
 }
 
 fn scorer(prediction: Grid) -> Scorer {
@@ -54,7 +55,7 @@ fn regions_and_rings_by_hand() {
 #[test]
 fn other_grids_are_asked_at_the_centres() {
     // Half as many voxels along x and y over a range that ends 2 m earlier; one layer, of the upper half.
-    let coarse = Grid { size: [3, 3, 1], bounds: [[-4.0, 2.0], [-4.0, 2.0], [0.0, 1.0]] };
+    let coarse = Grid { size: [3, 3, 1], bounds: [[-4.0, 2.0], [-4.0, 2.0], [0.0, 1.0]], ..TRUTH };
     let prediction: Vec<u8> = (0..9).map(|i| 1 + i % 3).collect();
     let labels = vec![0; 32];
     let score = scorer(coarse).score(&truth(labels), &blind(&prediction)).expect("a score").region(0);
@@ -112,4 +113,46 @@ fn what_does_not_fit_is_refused() {
     for rings in [vec![5.0, 2.0], vec![0.0], vec![f64::NAN]] {
         assert!(Scorer::new(4, 1, TRUTH, TRUTH, &Options { rings }).is_err());
     }
+}
+
+#[test]
+fn labels_of_the_ego_frame_are_led_to_the_lidar() {
+    // The lidar looks along the vehicle's -y, 2 m ahead of its origin and 1 m above: ego (x, y) is lidar (-y, x - 2).
+    let ego = Grid { axes: Axes::Ego, ..TRUTH };
+    let half = 0.5f64.sqrt();
+    let grid_to_lidar = Pose::new([half, 0.0, 0.0, half], [0.0, -2.0, -1.0]).expect("a pose");
+    let truth = Truth { grid_to_lidar, ..truth(vec![0; 32]) };
+    // Each voxel of the prediction has a class of its own.
+    let classes = 33;
+    let prediction: Vec<u8> = (1..=32).collect();
+    let options = Options { rings: vec![2.0] };
+    let scorer = Scorer::new(classes, 1, ego, TRUTH, &options).expect("sound options");
+    let support: Vec<u16> = (0..32).map(|i| u16::from(i == 1)).collect();
+    let score = scorer.score(&truth, &Prediction { support: Some(&support), ..blind(&prediction) }).expect("a score");
+    let (mut expected, mut near) = (vec![0; classes], 0);
+    for (x, y, z) in (0..32usize).map(|i| (i / 8, i / 2 % 4, i % 2)) {
+        // Centres are at -3, -1, 1, 3 m, in layers at -0.5 and 0.5 m, of which only the upper stays inside.
+        let [ego_x, ego_y] = [x, y].map(|i| 2 * i as i32 - 3);
+        let (lidar_x, lidar_y) = (-ego_y, ego_x - 2);
+        let index = |metres: i32| (metres + 4) / 2;
+        let inside = lidar_y > -4 && z == 1;
+        let at = if inside { 1 + 8 * index(lidar_x) + 2 * index(lidar_y) } else { 0 };
+        expected[at as usize] += 1;
+        near += u64::from(lidar_x * lidar_x + lidar_y * lidar_y < 4);
+    }
+    assert_eq!((0..classes).map(|class| score.region(0).count(0, class as u8)).collect::<Vec<u64>>(), expected);
+    assert_eq!((score.regions[0][0].voxels(), near), (8, 8), "rings are around the lidar");
+    assert_eq!(score.region(2).voxels(), 0, "voxel 1 of the prediction is no label's");
+
+    // A prediction with the axes of the labels is compared voxel by voxel, whatever the pose.
+    let shared = Scorer::new(classes, 1, ego, ego, &options).expect("sound options");
+    let score = shared.score(&truth, &blind(&prediction)).expect("a score");
+    assert!((1..classes).all(|class| score.region(0).count(0, class as u8) == 1));
+    assert_eq!(score.regions[0][0].voxels(), 8);
+    let error = Scorer::new(classes, 1, TRUTH, ego, &options).expect_err("no way from the lidar to the vehicle");
+    assert!(error.message().contains("axes of the ego vehicle"), "{error}");
+    // Losses are of the network's own voxels.
+    let logits = vec![0.0; 32 * classes];
+    let error = scorer.score(&truth, &Prediction { logits: Some(&logits), ..blind(&prediction) });
+    assert!(error.expect_err("other voxels").message().starts_with("losses need labels on the grid"));
 }

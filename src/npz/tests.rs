@@ -133,3 +133,33 @@ fn arrays_that_cannot_be_written_are_refused() {
         assert!(!path.exists());
     }
 }
+
+#[test]
+fn integers_of_every_width() {
+    let read = |descr: &str, shape: &[usize], bytes: &[u8]| {
+        let file = [npy_header(descr, shape), bytes.to_vec()].concat();
+        read_integers(&mut Cursor::new(&file), file.len() as u64)
+    };
+    for (descr, bytes, expected) in [
+        ("|i1", &[0xff, 2][..], [-1, 2]),
+        ("|u1", &[0xff, 2], [255, 2]),
+        ("<i2", &[0xfe, 0xff, 0, 1], [-2, 256]),
+        ("<u2", &[0xfe, 0xff, 0, 1], [65534, 256]),
+        ("<i4", &[0xfe, 0xff, 0xff, 0xff, 0, 0, 1, 0], [-2, 65536]),
+        ("<u4", &[0xfe, 0xff, 0xff, 0xff, 0, 0, 1, 0], [4_294_967_294, 65536]),
+        ("<i8", &[0xfe, 255, 255, 255, 255, 255, 255, 255, 0, 0, 0, 0, 1, 0, 0, 0], [-2, 1 << 32]),
+        ("<u8", &[7, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0], [7, 1 << 32]),
+    ] {
+        assert_eq!(read(descr, &[1, 2], bytes).unwrap(), (vec![1, 2], expected.to_vec()), "{descr}");
+        assert!(read(descr, &[1, 2], &bytes[1..]).is_err(), "{descr} cut");
+        assert!(read(descr, &[3], bytes).is_err(), "{descr} of another shape");
+    }
+    for descr in [">i4", "<f4", "|b1", "|S4", "", "<i3", "ü1"] {
+        let error = read(descr, &[1], &[0; 4]).unwrap_err();
+        assert!(error.kind() == ErrorKind::Unsupported && error.message().contains("integers"), "{descr}: {error}");
+    }
+    let error = read("<u8", &[1], &[0xff; 8]).unwrap_err();
+    assert!(error.message().contains("18446744073709551615"), "{error}");
+    assert!(read("<i8", &[0, 4], &[]).unwrap().1.is_empty());
+    assert!(read("<i8", &[usize::MAX, 4], &[]).is_err());
+}
