@@ -10,6 +10,7 @@ mod inspect;
 mod profile;
 mod rig;
 mod run;
+mod scoring;
 mod selftest;
 mod source;
 mod synth;

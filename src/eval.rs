@@ -8,15 +8,22 @@
 //! the predicted voxel that contains its centre; where there is none, the network has said nothing, and it counts as
 //! predicted empty. Networks predict in the lidar frame; labels with other axes are led there by [`Truth::grid_to_lidar`].
 
+mod comparison;
 mod confusion;
+mod journal;
 pub mod losses;
 mod majority;
 pub mod ray_iou;
 mod report;
+mod table;
+mod totals;
 
+pub use comparison::Comparison;
 pub use confusion::Confusion;
+pub use journal::Journal;
 pub use majority::majority;
 pub use report::Report;
+pub use totals::{FrameScore, Totals};
 
 use crate::dataset::{Axes, Grid, IGNORED, Pose, Truth};
 use crate::error::{Error, Result};
@@ -126,7 +133,7 @@ impl Scorer {
     /// grids, or classes beyond its own.
     pub fn score(&self, truth: &Truth, prediction: &Prediction<'_>) -> Result<Score> {
         self.check(truth, prediction)?;
-        let mut score = Score::new(self.classes, self.masks + 2, self.ends.len() + 1);
+        let mut score = Score::new(self.kind());
         let pose = &truth.grid_to_lidar;
         let resampled = self.resampled(pose, prediction.classes);
         let (grid, classes) = (&self.truth, self.classes);
@@ -162,8 +169,13 @@ impl Scorer {
         Ok(score)
     }
 
-    /// The prediction on the grid of the truth.
-    fn resampled<'a>(&self, pose: &Pose, classes: &'a [u8]) -> Cow<'a, [u8]> {
+    /// The prediction on the grid of the truth: for each of its voxels, the class where its centre lies. `pose` is the
+    /// frame's [`Truth::grid_to_lidar`].
+    ///
+    /// # Panics
+    /// If `classes` has not the voxels of the prediction's grid.
+    pub fn resampled<'a>(&self, pose: &Pose, classes: &'a [u8]) -> Cow<'a, [u8]> {
+        assert_eq!(classes.len(), self.prediction.voxels(), "voxels of the prediction");
         if self.truth == self.prediction {
             return Cow::Borrowed(classes);
         }
@@ -181,6 +193,11 @@ impl Scorer {
     fn ring_at(&self, pose: &Pose, voxel: [usize; 3]) -> usize {
         let [x, y, _] = self.centre(pose, voxel);
         ring(&self.ends, x, y)
+    }
+
+    /// How many regions and rings a score has.
+    pub fn kind(&self) -> Kind {
+        Kind { classes: self.classes, regions: self.masks + 2, rings: self.ends.len() + 1 }
     }
 
     /// Where the prediction speaks of voxel `[x, y, z]` of the truth; nowhere if that lies outside its grid.
@@ -240,6 +257,17 @@ fn ring(ends: &[f64], x: f64, y: f64) -> usize {
     ends.iter().position(|&end| distance < end).unwrap_or(ends.len())
 }
 
+/// How large a score is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Kind {
+    /// Classes, the empty one among them.
+    pub classes: usize,
+    /// Regions ([`Scorer::regions`]).
+    pub regions: usize,
+    /// Distance rings, that beyond the last end among them.
+    pub rings: usize,
+}
+
 /// The score of a frame, or of many: a confusion for each region and ring.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Score {
@@ -290,9 +318,9 @@ impl LossSum {
 
 impl Score {
     /// Nothing counted.
-    pub fn new(classes: usize, regions: usize, rings: usize) -> Self {
-        let regions = vec![vec![Confusion::new(classes); rings]; regions];
-        Self { regions, rays: RayCounts::new(classes), losses: LossSum::default() }
+    pub fn new(kind: Kind) -> Self {
+        let regions = vec![vec![Confusion::new(kind.classes); kind.rings]; kind.regions];
+        Self { regions, rays: RayCounts::new(kind.classes), losses: LossSum::default() }
     }
 
     /// Adds the counts of another score of the same kind.

@@ -1,22 +1,30 @@
 //! `voxcast eval`
 
+use super::scoring::{self, Means, Predictor, Says};
 use super::source::{FORMS, Source};
 use super::{Machine, frame, terminal};
 use clap::Args;
+use serde_json::json;
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
-use voxcast::dataset::{DataSet, Frame, Grid};
-use voxcast::eval::{Options, Prediction, Report, Score, Scorer, majority};
-use voxcast::rig::RigBuilder;
-use voxcast::{Error, Model, Occupancy, Result, Rig, Session, SessionOptions, Threads};
+use std::sync::Arc;
+use voxcast::dataset::DataSet;
+use voxcast::eval::{
+    Comparison, Confusion, FrameScore, Journal, Options, Report, Scorer, Totals, majority, write_text,
+};
+use voxcast::picture::{Matrix, Palette, draw_matrix};
+use voxcast::{Error, Model, Result};
 
 /// Score a model on a data set with labels: IoU, mIoU and every class, near and far, seen and unseen.
+///
+/// With --compare, two models are scored on the same frames and set against each other.
 #[derive(Args, Debug)]
 #[command(after_help = format!("\
 Examples:
   voxcast eval --model model.safetensors --data synthetic:heldout
   voxcast eval --model model.safetensors --data synthetic:heldout --json scores.json --markdown scores.md
+  voxcast eval --model model.safetensors --data synthetic:heldout --resume scores.jsonl --confusion confusion.png
+  voxcast eval --compare f32.safetensors f16.safetensors --data synthetic:heldout
   voxcast eval --majority synthetic:train --data synthetic:heldout    # what can be said without looking
   voxcast eval --model model.safetensors --data surroundocc:nuscenes:nuscenes_occ:val
   voxcast eval --model model.safetensors --data semantickitti:kitti:08
@@ -24,8 +32,11 @@ Examples:
 {FORMS}"))]
 pub struct Eval {
     /// The model
-    #[arg(long, required_unless_present = "majority", conflicts_with = "majority")]
+    #[arg(long, required_unless_present_any = ["majority", "compare"], conflicts_with_all = ["majority", "compare"])]
     model: Option<PathBuf>,
+    /// Score two models, and compare what they say class by class
+    #[arg(long, value_names = ["A", "B"], num_args = 2, conflicts_with = "majority")]
+    compare: Vec<PathBuf>,
     /// Instead of a model, predict in each voxel the class that is most frequent there in another set
     #[arg(long, value_name = "SET")]
     majority: Option<Source>,
@@ -41,6 +52,13 @@ pub struct Eval {
     /// Also compute the four losses of the training, of level 0
     #[arg(long, conflicts_with = "majority")]
     losses: bool,
+    /// Keep every frame's score in FILE, and go on from those that are there already, after a stop or with a higher
+    /// --limit
+    #[arg(long, value_name = "FILE")]
+    resume: Option<PathBuf>,
+    /// Draw the confusion matrix; with --compare, of A's classes with B's
+    #[arg(long, value_name = "FILE.png")]
+    confusion: Option<PathBuf>,
     /// Write all ratios and counts as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -51,46 +69,37 @@ pub struct Eval {
     machine: Machine,
 }
 
-/// Who predicts.
-enum Predictor {
-    Model(Arc<Model>),
-    /// The same classes for every frame.
-    Constant(Vec<u8>),
-}
-
 impl Eval {
     pub fn run(self) -> Result<()> {
-        for path in [&self.json, &self.markdown].into_iter().flatten() {
+        for path in [&self.json, &self.markdown, &self.confusion, &self.resume].into_iter().flatten() {
             frame::check_output(path)?;
         }
         let set = self.data.open()?;
         let options = Options::default();
-        let (predictor, grid, title) = self.predictor(&*set)?;
-        let scorer = Scorer::new(set.classes().len(), set.masks().len(), set.grid(), grid, &options)?;
+        let predictors = self.predictors(&*set, &options)?;
         let count = self.limit.map_or(set.len(), |limit| set.len().min(limit as usize));
-        let scores = self.score(&*set, &predictor, &scorer, count)?;
-        let regions = Scorer::regions(set.masks());
-        let mut total = Score::new(set.classes().len(), regions.len(), options.rings.len() + 1);
-        scores.iter().for_each(|score| total.merge(score));
-        let report = Report {
-            title: &title,
-            classes: set.classes(),
-            regions: &regions,
-            rings: &options.rings,
-            frames: count,
-            total: &total,
+        let kind = predictors[0].scorer.kind();
+        let mut totals = Totals::new(kind, predictors.len(), count);
+        let journal = match &self.resume {
+            Some(path) => Some(self.journal(path, &*set, &predictors, &options, &mut totals, count)?),
+            None => None,
         };
-        print!("{}", report.text());
-        if let Some(path) = &self.json {
-            write(path, &format!("{:#}\n", report.json()))?;
-        }
-        if let Some(path) = &self.markdown {
-            write(path, &report.markdown())?;
-        }
-        Ok(())
+        let means = Means {
+            workers: usize::from(self.workers),
+            threads: self.machine.threads.count(),
+            isa: self.machine.isa()?,
+            losses: self.losses,
+        };
+        let totals = scoring::score(&*set, &predictors, &means, totals, journal, count)?.finish();
+        self.report(&*set, &predictors, &options, &totals, count)
     }
 
-    fn predictor(&self, set: &dyn DataSet) -> Result<(Predictor, Grid, String)> {
+    fn predictors(&self, set: &dyn DataSet, options: &Options) -> Result<Vec<Predictor>> {
+        let predictor = |name: String, says: Says, always| -> Result<Predictor> {
+            let grid = says.grid(always);
+            let scorer = Scorer::new(set.classes().len(), set.masks().len(), set.grid(), grid, options)?;
+            Ok(Predictor { name, says, scorer })
+        };
         if let Some(source) = &self.majority {
             let other = source.open()?;
             if other.classes() != set.classes() {
@@ -99,122 +108,95 @@ impl Eval {
             let bar = terminal::progress("counting", other.len());
             let classes = majority(&*other, &mut |done| bar.set_position(done as u64))?;
             bar.finish_and_clear();
-            let title = format!("majority of {source} on {}", self.data);
-            return Ok((Predictor::Constant(classes), other.grid(), title));
+            return Ok(vec![predictor(format!("majority of {source}"), Says::Always(classes), other.grid())?]);
         }
-        let path = self.model.as_deref().unwrap_or(Path::new(""));
-        let model = Model::open(path)?;
-        let (found, expected) = (model.network().classes, set.classes().len());
-        if found != expected {
-            let message = format!("a model of {found} classes, {} has {expected}", self.data);
-            return Err(Error::mismatch(message).in_file(path));
-        }
-        let title = format!("{} on {}", path.display(), self.data);
-        let grid = Grid::of(model.network());
-        Ok((Predictor::Model(Arc::new(model)), grid, title))
+        let open = |path: &PathBuf| {
+            let model = Model::open(path)?;
+            let (found, expected) = (model.network().classes, set.classes().len());
+            if found != expected {
+                let message = format!("a model of {found} classes, {} has {expected}", self.data);
+                return Err(Error::mismatch(message).in_file(path));
+            }
+            predictor(path.display().to_string(), Says::Model(Arc::new(model)), set.grid())
+        };
+        self.model.iter().chain(&self.compare).map(open).collect()
     }
 
-    /// Scores the first `count` frames, several at a time.
-    fn score(&self, set: &dyn DataSet, predictor: &Predictor, scorer: &Scorer, count: usize) -> Result<Vec<Score>> {
-        let workers = usize::from(self.workers).min(count);
-        let threads = (self.machine.threads.count() / workers.max(1)).max(1);
-        let isa = self.machine.isa()?;
-        let next = AtomicUsize::new(0);
-        let results: Mutex<Result<Vec<Option<Score>>>> = Mutex::new(Ok(vec![None; count]));
-        let bar = terminal::progress("scoring", count);
-        let work = || -> Result<()> {
-            let threads = Threads::new(threads)?;
-            let options = SessionOptions { isa, threads, logits: self.losses, ..SessionOptions::default() };
-            let mut worker = Worker { predictor, options, running: None };
-            loop {
-                let index = next.fetch_add(1, Ordering::Relaxed);
-                if index >= count {
-                    return Ok(());
-                }
-                let score = worker.score(set, index, scorer)?;
-                if let Ok(scores) = &mut *results.lock().unwrap_or_else(|e| e.into_inner()) {
-                    scores[index] = Some(score);
-                }
-                bar.inc(1);
+    /// Opens the journal and counts the frames that it has.
+    fn journal(
+        &self,
+        path: &Path,
+        set: &dyn DataSet,
+        predictors: &[Predictor],
+        options: &Options,
+        totals: &mut Totals,
+        count: usize,
+    ) -> Result<Journal> {
+        let what = json!({
+            "data": self.data.to_string(),
+            "predictors": predictors.iter().map(|predictor| predictor.says.identity()).collect::<Vec<_>>(),
+            "losses": self.losses,
+            "rings": options.rings,
+        });
+        let index_of: HashMap<&str, usize> = (0..count).map(|index| (set.id(index), index)).collect();
+        Journal::open(path, &what, predictors[0].scorer.kind(), predictors.len(), &mut |frame, score| {
+            if let Some(&index) = index_of.get(frame).filter(|&&index| !totals.has(index)) {
+                totals.add(index, score);
+            }
+        })
+    }
+
+    fn report(
+        &self,
+        set: &dyn DataSet,
+        predictors: &[Predictor],
+        options: &Options,
+        totals: &FrameScore,
+        frames: usize,
+    ) -> Result<()> {
+        let (data, regions) = (self.data.to_string(), Scorer::regions(set.masks()));
+        let titles: Vec<String> = predictors.iter().map(|predictor| format!("{} on {data}", predictor.name)).collect();
+        let reports: Vec<Report<'_>> = titles
+            .iter()
+            .zip(&totals.scores)
+            .map(|(title, total)| Report {
+                title,
+                classes: set.classes(),
+                regions: &regions,
+                rings: &options.rings,
+                frames,
+                total,
+            })
+            .collect();
+        let sums: Vec<Confusion> = totals.scores.iter().map(|score| score.region(0)).collect();
+        let names = || Some([predictors.first()?.name.as_str(), predictors.get(1)?.name.as_str()]);
+        let comparison = names().and_then(|names| Comparison::of(names, &data, set.classes(), frames, &sums, totals));
+        let (text, markdown, json) = match &comparison {
+            None => (reports[0].text(), reports[0].markdown(), reports[0].json()),
+            Some(comparison) => {
+                let [a, b] = [&reports[0], &reports[1]];
+                let json = json!({ "comparison": comparison.json(), "reports": [a.json(), b.json()] });
+                let markdown = [comparison.markdown(), a.markdown(), b.markdown()].join("\n");
+                (comparison.text(), markdown, json)
             }
         };
-        std::thread::scope(|scope| {
-            for _ in 0..workers {
-                scope.spawn(|| {
-                    if let Err(error) = work() {
-                        next.store(count, Ordering::Relaxed);
-                        let mut results = results.lock().unwrap_or_else(|e| e.into_inner());
-                        if results.is_ok() {
-                            *results = Err(error);
-                        }
-                    }
-                });
-            }
-        });
-        bar.finish_and_clear();
-        let scores = results.into_inner().unwrap_or_else(|e| e.into_inner())?;
-        Ok(scores.into_iter().flatten().collect())
-    }
-}
-
-/// One of those that score frames side by side.
-struct Worker<'a> {
-    predictor: &'a Predictor,
-    options: SessionOptions,
-    running: Option<Running>,
-}
-
-/// The means to run frames, made for the first one.
-struct Running {
-    session: Session,
-    builder: RigBuilder,
-    calibration: Vec<[f32; 16]>,
-}
-
-impl Worker<'_> {
-    fn score(&mut self, set: &dyn DataSet, index: usize, scorer: &Scorer) -> Result<Score> {
-        match self.predictor {
-            Predictor::Constant(classes) => {
-                scorer.score(&set.truth(index)?, &Prediction { classes, support: None, logits: None })
-            }
-            Predictor::Model(model) => {
-                let Frame { scene, truth } = set.frame(index)?;
-                let said = |e: Error| Error::new(e.kind(), format!("frame {}: {}", set.id(index), e.message()));
-                scene.check(model.network()).map_err(said)?;
-                let running = match &mut self.running {
-                    Some(running) => running,
-                    none => none.insert(Running::new(model, &scene.lidar2img, &self.options).map_err(said)?),
-                };
-                running.calibrate(&scene.lidar2img).map_err(said)?;
-                let result = running.session.run_scene(&scene).map_err(said)?;
-                let Occupancy { classes, support, logits, .. } = result;
-                scorer.score(&truth, &Prediction { classes, support: Some(support), logits })
-            }
+        print!("{text}");
+        if let Some(path) = &self.json {
+            write_text(path, &format!("{json:#}\n"))?;
         }
-    }
-}
-
-impl Running {
-    fn new(model: &Arc<Model>, calibration: &[[f32; 16]], options: &SessionOptions) -> Result<Self> {
-        let builder = RigBuilder::new(model.network(), calibration.len(), options.isa)?;
-        let mut builder = builder.with_threads(options.threads.clone());
-        let rig = Arc::new(builder.build(calibration)?);
-        let session = Session::new(model.clone(), rig, options)?;
-        Ok(Self { session, builder, calibration: calibration.to_vec() })
-    }
-
-    /// Builds the matrices anew where the cameras have moved.
-    fn calibrate(&mut self, calibration: &[[f32; 16]]) -> Result<()> {
-        if self.calibration != calibration {
-            let rig: Rig = self.builder.build(calibration)?;
-            self.session.set_rig(Arc::new(rig))?;
-            self.calibration = calibration.to_vec();
+        if let Some(path) = &self.markdown {
+            write_text(path, &markdown)?;
+        }
+        if let Some(path) = &self.confusion {
+            let palette = Palette::of(set.classes().len());
+            let (counts, rows, columns, title) = match &comparison {
+                None => (sums[0].counts(), "Truth", "Prediction", titles[0].clone()),
+                Some(c) => (c.agreement.counts(), "A", "B", format!("A: {}, B: {}, on {data}", c.names[0], c.names[1])),
+            };
+            let subtitle = format!("{frames} frames; shares of each row in per cent");
+            let matrix = Matrix { title: &title, subtitle: &subtitle, rows, columns, counts, palette: &palette };
+            draw_matrix(&matrix)?.write_png(path)?;
         }
         Ok(())
     }
-}
-
-/// Writes a text file, whole or not at all.
-fn write(path: &Path, text: &str) -> Result<()> {
-    voxcast::eval::write_text(path, text)
 }

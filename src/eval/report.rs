@@ -2,6 +2,7 @@
 
 use super::losses::Losses;
 use super::ray_iou::THRESHOLDS;
+use super::table::{Table, percent};
 use super::{Confusion, Score};
 use serde_json::{Value, json};
 
@@ -20,12 +21,6 @@ pub struct Report<'a> {
     pub frames: usize,
     /// Their sum.
     pub total: &'a Score,
-}
-
-/// A table: a heading for each column, rows of as many cells. The first column is words, the others are numbers.
-struct Table {
-    head: Vec<String>,
-    rows: Vec<Vec<String>>,
 }
 
 impl Report<'_> {
@@ -166,32 +161,5 @@ impl Report<'_> {
             [(*region).to_owned(), percent(value(&self.total.region(index)))].into_iter().chain(rings).collect()
         };
         Table { head, rows: self.regions.iter().enumerate().map(row).collect() }
-    }
-}
-
-fn percent(ratio: Option<f64>) -> String {
-    ratio.map_or("-".to_owned(), |ratio| format!("{:.2}", 100.0 * ratio))
-}
-
-impl Table {
-    fn text(&self) -> String {
-        let lines = || std::iter::once(&self.head).chain(&self.rows);
-        let widths: Vec<usize> =
-            (0..self.head.len()).map(|c| lines().map(|line| line[c].len()).max().unwrap_or(0)).collect();
-        let mut text = String::new();
-        for line in lines() {
-            let mut out = format!("{:<width$}", line[0], width = widths[0]);
-            line.iter().zip(&widths).skip(1).for_each(|(cell, &width)| out += &format!("  {cell:>width$}"));
-            text += out.trim_end();
-            text.push('\n');
-        }
-        text
-    }
-
-    fn markdown(&self) -> String {
-        let line = |cells: &[String]| format!("| {} |\n", cells.join(" | "));
-        let rule = format!("|---|{}\n", "---:|".repeat(self.head.len() - 1));
-        let rows: String = self.rows.iter().map(|row| line(row)).collect();
-        line(&self.head) + &rule + &rows
     }
 }

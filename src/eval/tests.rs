@@ -39,7 +39,7 @@ fn regions_and_rings_by_hand() {
     let support: Vec<u16> = (0..32).map(|i| u16::from(i >= 20)).collect();
     let found =
         scorer(TRUTH).score(&truth, &Prediction { support: Some(&support), ..blind(&prediction) }).expect("a score");
-    let mut expected = Score::new(4, 3, 2);
+    let mut expected = Score::new(Kind { classes: 4, regions: 3, rings: 2 });
     for (i, &label) in truth.labels.iter().enumerate().filter(|&(_, &label)| label != IGNORED) {
         // Columns are 2 m wide: of 4 x 4, the inner four have their centres 1.41 m away, the others more than 3 m.
         let ring = usize::from(!((1..3).contains(&(i / 8)) && (1..3).contains(&(i / 2 % 4))));
@@ -75,7 +75,7 @@ fn sums_do_not_depend_on_order() {
         scorer.score(&truth(labels()), &blind(&prediction)).expect("a score")
     };
     let sum = |seeds: [u8; 3]| {
-        let mut sum = Score::new(4, 3, 2);
+        let mut sum = Score::new(Kind { classes: 4, regions: 3, rings: 2 });
         seeds.iter().for_each(|&seed| sum.merge(&score(seed)));
         sum
     };
@@ -140,14 +140,14 @@ fn labels_of_the_ego_frame_are_led_to_the_lidar() {
         expected[at as usize] += 1;
         near += u64::from(lidar_x * lidar_x + lidar_y * lidar_y < 4);
     }
-    assert_eq!((0..classes).map(|class| score.region(0).count(0, class as u8)).collect::<Vec<u64>>(), expected);
+    assert_eq!((0..classes).map(|class| score.region(0).count(0, class)).collect::<Vec<u64>>(), expected);
     assert_eq!((score.regions[0][0].voxels(), near), (8, 8), "rings are around the lidar");
     assert_eq!(score.region(2).voxels(), 0, "voxel 1 of the prediction is no label's");
 
     // A prediction with the axes of the labels is compared voxel by voxel, whatever the pose.
     let shared = Scorer::new(classes, 1, ego, ego, &options).expect("sound options");
     let score = shared.score(&truth, &blind(&prediction)).expect("a score");
-    assert!((1..classes).all(|class| score.region(0).count(0, class as u8) == 1));
+    assert!((1..classes).all(|class| score.region(0).count(0, class) == 1));
     assert_eq!(score.regions[0][0].voxels(), 8);
     let error = Scorer::new(classes, 1, TRUTH, ego, &options).expect_err("no way from the lidar to the vehicle");
     assert!(error.message().contains("axes of the ego vehicle"), "{error}");

@@ -9,11 +9,13 @@ mod canvas;
 mod grid;
 mod layout;
 mod legend;
+mod matrix;
 mod palette;
 mod text;
 mod vehicle;
 mod voxels;
 
+pub use matrix::{Matrix, draw_matrix};
 pub use palette::{Class, Palette};
 pub use text::FONT_LICENSE;
 
