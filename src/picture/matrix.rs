@@ -10,7 +10,7 @@ const MARGIN: usize = 56;
 const CELL: usize = 64;
 const SIZE: f32 = 24.0;
 /// Room for the longest class name, beside the rows and above the columns.
-const NAMES: usize = 260;
+const NAMES: usize = 310;
 /// Room for the number of voxels at the end of a row.
 const TOTAL: usize = 170;
 const HEADING: usize = 150;
