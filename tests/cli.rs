@@ -18,7 +18,8 @@ use std::process::{Command, Output};
 use voxcast::graph::Rewrites;
 use voxcast::import::{Source, import};
 use voxcast::model::Options;
-use voxcast::npz::{OwnedElements, read_npz};
+use voxcast::npz::{Array, Elements, OwnedElements, read_npz, write_npz};
+use voxcast::weights::Precision;
 use voxcast::{Network, Result};
 
 /// Address space for a program that is given hostile input: more than any of these networks needs, less than any lie.
@@ -318,6 +319,9 @@ fn help_and_usage() {
         &["profile", "--model", "m", "scene", "--by", "day"],
         &["profile", "--model", "m", "scene", "--repeat", "0"],
         &["demo", "--seed", "-1"],
+        &["eval", "--data", "synthetic:d"],
+        &["eval", "--model", "m", "--data", "occ3d:d"],
+        &["eval", "--model", "m", "--data", "semantickitti:d:22"],
     ] {
         let output = voxcast(bad);
         assert_eq!((output.status.code(), output.stdout.is_empty()), (Some(2), true), "{bad:?}");
@@ -752,4 +756,96 @@ fn synthetic_scenes_run_and_sets_go_on() {
     assert!(line.contains("other frames"), "{line}");
     let seeds = ["synth", "--network", &network, "--seed", "999999999", "--count", "2", "--set", &set];
     assert!(refused("", &seeds).contains("seeds below 1000000000"));
+}
+
+/// nuScenes with one key frame of the images in `samples`, and its labels of both kinds: a wall of cars 10 m ahead.
+fn write_nuscenes(root: &Path, images: &[String]) {
+    let cameras = ["CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"];
+    let (mut sensors, mut calibrated, mut egos, mut data) = (vec![], vec![], vec![], vec![]);
+    for (index, name) in cameras.into_iter().chain(["LIDAR_TOP"]).enumerate() {
+        let camera = index < cameras.len();
+        let turn = std::f64::consts::PI * index as f64 / 6.0;
+        let intrinsic = if camera { json!([[40, 0, 32], [0, 40, 16], [0, 0, 1]]) } else { json!([]) };
+        // Cameras look along +y, turned about z; the lidar's y looks along the vehicle's x.
+        let (s, c) = (turn.sin() * 0.5f64.sqrt(), turn.cos() * 0.5f64.sqrt());
+        let rotation = if camera { json!([c, -c, -s, s]) } else { json!([0.5f64.sqrt(), 0, 0, -0.5f64.sqrt()]) };
+        let file = if camera { images[index].clone() } else { "samples/LIDAR_TOP/sweep.pcd.bin".to_owned() };
+        sensors.push(json!({"token": name, "channel": name}));
+        calibrated
+            .push(json!({"token": name, "sensor_token": name, "translation": [1.1, 0, 2.1], "rotation": rotation,
+            "camera_intrinsic": intrinsic}));
+        egos.push(json!({"token": name, "translation": [5, 6, 0], "rotation": [1, 0, 0, 0]}));
+        data.push(json!({"token": name, "sample_token": "a", "ego_pose_token": name, "calibrated_sensor_token": name,
+            "filename": file, "is_key_frame": true, "height": 32, "width": 64}));
+    }
+    fs::create_dir(root.join("v1.0-mini")).unwrap();
+    for (table, rows) in [
+        ("sensor", sensors),
+        ("calibrated_sensor", calibrated),
+        ("ego_pose", egos),
+        ("sample_data", data),
+        ("scene", vec![json!({"token": "s", "name": "scene-0103"})]),
+        ("sample", vec![json!({"token": "a", "scene_token": "s", "timestamp": 7})]),
+    ] {
+        fs::write(root.join(format!("v1.0-mini/{table}.json")), json!(rows).to_string()).unwrap();
+    }
+    // 10 to 12 m ahead of the lidar, 4 m to either side, from 2 m below to 2 m above.
+    let mut rows = Vec::new();
+    for i in 0..16 * 4 * 8 {
+        rows.extend([92 + (i / 32) as u8, 120 + (i / 8 % 4) as u8, 6 + (i % 8) as u8, 4]);
+    }
+    let mut literal = format!("{{'descr': '|u1', 'fortran_order': False, 'shape': ({}, 4), }}", rows.len() / 4);
+    literal.push_str(&" ".repeat(117 - literal.len()));
+    let file = [b"\x93NUMPY\x01\x00\x76\x00", literal.as_bytes(), b"\n", &rows].concat();
+    fs::create_dir_all(root.join("occ/samples")).unwrap();
+    fs::write(root.join("occ/samples/sweep.pcd.bin.npy"), file).unwrap();
+    let mut semantics = vec![17u8; 640_000];
+    for (x, y, z) in (0..5 * 20 * 10).map(|i| (128 + i / 200, 90 + i / 10 % 20, 3 + i % 10)) {
+        semantics[(x * 200 + y) * 16 + z] = 4;
+    }
+    let mask = vec![1u8; 640_000];
+    let arrays = [("semantics", &semantics), ("mask_lidar", &mask), ("mask_camera", &mask)]
+        .map(|(name, values)| Array { name, shape: &[200, 200, 16], elements: Elements::U8(values) });
+    fs::create_dir_all(root.join("gts/scene-0103/a")).unwrap();
+    write_npz(&root.join("gts/scene-0103/a/labels.npz"), &arrays).unwrap();
+}
+
+#[test]
+fn published_sets_are_scored() {
+    let place = Place(tempfile::tempdir().unwrap());
+    let network = Network { classes: 17, cameras: 6, ..network() };
+    fs::write(place.path("model"), small::model_bytes(&network, Precision::F32, Rewrites::ALL, 3)).unwrap();
+    let scene = voxcast::demo::demo_scene(&network, 1);
+    scene.save(&place.path("samples")).unwrap();
+    let images: Vec<String> = scene.names.iter().map(|name| format!("samples/{name}.png")).collect();
+    write_nuscenes(place.0.path(), &images);
+    let (model, root) = (place.text("model"), place.0.path().to_str().unwrap());
+    let (surroundocc, occ3d) = (format!("surroundocc:{root}:{root}/occ:val"), format!("occ3d:{root}:{root}/gts"));
+    let scores = |predictor: [&str; 2], data: &str| -> Value {
+        let json = place.text("scores.json");
+        done(&["eval", predictor[0], predictor[1], "--data", data, "--json", &json]);
+        serde_json::from_slice(&fs::read(json).unwrap()).unwrap()
+    };
+    let of_model = scores(["--model", &model], &occ3d);
+    assert_eq!(of_model["frames"], 1);
+    assert_eq!(of_model["regions"].as_object().unwrap().len(), 4, "{of_model}");
+    assert_eq!(scores(["--model", &model], &surroundocc)["regions"].as_object().unwrap().len(), 2);
+    // The same wall in the frames of lidar and vehicle.
+    for predictor in [&surroundocc, &occ3d] {
+        let iou = &scores(["--majority", predictor], &occ3d)["regions"]["camera"]["iou"];
+        assert_eq!(iou.as_f64(), Some(1.0), "{predictor}");
+    }
+    let line = text(&voxcast(&["eval", "--majority", &occ3d, "--data", &surroundocc]).stderr);
+    assert!(line.contains("axes of the ego vehicle"), "{line}");
+    fs::remove_file(place.path("gts/scene-0103/a/labels.npz")).unwrap();
+    refused("gts/scene-0103/a/labels.npz", &["eval", "--model", &model, "--data", &occ3d]);
+
+    let kitti = place.path("kitti/sequences/08");
+    fs::create_dir_all(kitti.join("voxels")).unwrap();
+    fs::write(kitti.join("calib.txt"), "P2: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: 1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
+    fs::write(kitti.join("voxels/000000.label"), vec![0; 4 << 20]).unwrap();
+    let data = format!("semantickitti:{root}/kitti");
+    let line = refused("model", &["eval", "--model", &model, "--data", &data]);
+    assert!(line.contains("a model of 17 classes") && line.contains("has 20"), "{line}");
+    refused("voxels/000000.invalid", &["eval", "--majority", &data, "--data", &data]);
 }

@@ -1,4 +1,4 @@
-//! Any bytes as an `.npz`: an error, or arrays as long as their shapes say.
+//! Any bytes as an `.npz` and as an `.npy` of integers: an error, or arrays as long as their shapes say.
 //!
 //! The input is tried as a whole archive, and as the one entry of a sound one: a checksum cannot be found by mutation.
 
@@ -6,7 +6,7 @@
 
 use libfuzzer_sys::fuzz_target;
 use std::io::{Cursor, Write};
-use voxcast::npz::{OwnedElements, read_npz};
+use voxcast::npz::{OwnedElements, read_npy_integers, read_npz};
 use voxcast_fuzz::scratch_file;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
@@ -15,6 +15,10 @@ use zip::{CompressionMethod, ZipWriter};
 fn read(bytes: &[u8]) {
     let file = scratch_file("npz");
     std::fs::write(&file, bytes).expect("room for a small file");
+    let product = |shape: &[usize]| shape.iter().try_fold(1usize, |n, &axis| n.checked_mul(axis));
+    if let Ok((shape, integers)) = read_npy_integers(&file) {
+        assert_eq!(Some(integers.len()), product(&shape), "{shape:?}");
+    }
     let Ok(arrays) = read_npz(&file) else { return };
     for array in arrays {
         let len = match &array.elements {
@@ -22,7 +26,7 @@ fn read(bytes: &[u8]) {
             OwnedElements::U16(v) => v.len(),
             OwnedElements::F32(v) => v.len(),
         };
-        assert_eq!(Some(len), array.shape.iter().try_fold(1usize, |n, &axis| n.checked_mul(axis)), "{:?}", array.shape);
+        assert_eq!(Some(len), product(&array.shape), "{:?}", array.shape);
     }
 }
 

@@ -118,7 +118,11 @@ impl NuScenes {
 /// Where samples are, and where tables are.
 fn find_tables(root: &Path) -> Result<(PathBuf, PathBuf)> {
     if root.join("sample.json").is_file() {
-        return Ok((root.join(".."), root.to_owned()));
+        let beside = match root.parent().filter(|_| root.file_name().is_some()) {
+            Some(parent) => parent.to_owned(),
+            None => root.join(".."),
+        };
+        return Ok((beside, root.to_owned()));
     }
     let failed = |e: &std::io::Error| Error::io(root, "read", e);
     let mut found = Vec::new();

@@ -102,7 +102,7 @@ impl FromStr for Split {
             "val" => Ok(Split::Val),
             "test" => Ok(Split::Test),
             _ => match text.parse() {
-                Ok(number @ 0..=21) if text.len() == 2 => Ok(Split::Sequence(number)),
+                Ok(number @ 0..=21) if text.len() == 2 && !text.starts_with('+') => Ok(Split::Sequence(number)),
                 _ => Err(format!("{text:?}, expected train, val, test or a sequence 00 to 21")),
             },
         }

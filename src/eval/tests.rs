@@ -117,7 +117,7 @@ fn what_does_not_fit_is_refused() {
 
 #[test]
 fn labels_of_the_ego_frame_are_led_to_the_lidar() {
-    // The lidar looks along the vehicle's -y, 2 m ahead of its origin and 1 m above: ego (x, y) is lidar (-y, x - 2).
+    // The lidar's y looks ahead; it sits 2 m ahead of the vehicle's origin and 1 m above: (x, y) is (-y, x - 2) of it.
     let ego = Grid { axes: Axes::Ego, ..TRUTH };
     let half = 0.5f64.sqrt();
     let grid_to_lidar = Pose::new([half, 0.0, 0.0, half], [0.0, -2.0, -1.0]).expect("a pose");
@@ -127,7 +127,7 @@ fn labels_of_the_ego_frame_are_led_to_the_lidar() {
     let prediction: Vec<u8> = (1..=32).collect();
     let options = Options { rings: vec![2.0] };
     let scorer = Scorer::new(classes, 1, ego, TRUTH, &options).expect("sound options");
-    let support: Vec<u16> = (0..32).map(|i| u16::from(i == 1)).collect();
+    let support: Vec<u16> = (0..32).map(|i| u16::from(i < 2)).collect();
     let score = scorer.score(&truth, &Prediction { support: Some(&support), ..blind(&prediction) }).expect("a score");
     let (mut expected, mut near) = (vec![0; classes], 0);
     for (x, y, z) in (0..32usize).map(|i| (i / 8, i / 2 % 4, i % 2)) {
@@ -142,7 +142,7 @@ fn labels_of_the_ego_frame_are_led_to_the_lidar() {
     }
     assert_eq!((0..classes).map(|class| score.region(0).count(0, class)).collect::<Vec<u64>>(), expected);
     assert_eq!((score.regions[0][0].voxels(), near), (8, 8), "rings are around the lidar");
-    assert_eq!(score.region(2).voxels(), 0, "voxel 1 of the prediction is no label's");
+    assert_eq!(score.region(2).voxels(), 1, "the lowest corner is a label's, what is above it is not");
 
     // A prediction with the axes of the labels is compared voxel by voxel, whatever the pose.
     let shared = Scorer::new(classes, 1, ego, ego, &options).expect("sound options");

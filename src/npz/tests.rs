@@ -162,4 +162,13 @@ fn integers_of_every_width() {
     assert!(error.message().contains("18446744073709551615"), "{error}");
     assert!(read("<i8", &[0, 4], &[]).unwrap().1.is_empty());
     assert!(read("<i8", &[usize::MAX, 4], &[]).is_err());
+    let file = [npy_header("<i4", &[2, 1]), vec![0; 8]].concat();
+    for at in 0..128 {
+        let mut corrupt = file.clone();
+        corrupt[at] ^= 0x41;
+        // Padding and the version may be another.
+        if let Ok((shape, numbers)) = read_integers(&mut Cursor::new(&corrupt), file.len() as u64) {
+            assert_eq!(shape.iter().product::<usize>(), numbers.len(), "byte {at}");
+        }
+    }
 }
