@@ -211,23 +211,8 @@ fn read_from(reader: impl Read + Seek, length: u64) -> Result<Vec<OwnedArray>> {
 
 fn read_array(entry: &mut impl Read, size: u64) -> Result<(Vec<usize>, OwnedElements)> {
     let failed = |e: io::Error| Error::format(format!("cannot be read: {e}"));
-    let mut start = [0u8; 8];
-    entry.read_exact(&mut start).map_err(failed)?;
-    if &start[..6] != b"\x93NUMPY" || !(1..=3).contains(&start[6]) {
-        return Err(Error::format(format!("starts with {start:02x?}, expected \\x93NUMPY and version 1 to 3")));
-    }
-    let wide = if start[6] == 1 { 2 } else { 4 };
-    let mut length = [0u8; 4];
-    entry.read_exact(&mut length[..wide]).map_err(failed)?;
-    let length = u64::from(u32::from_le_bytes(length));
-    if length > 1 << 16 {
-        return Err(Error::format(format!("header of {length} bytes, expected at most 65536")));
-    }
-    let mut literal = Vec::new();
-    entry.take(length).read_to_end(&mut literal).map_err(failed)?;
-    let literal = std::str::from_utf8(&literal).map_err(|_| Error::format("header is not text"))?;
-    let (descr, shape) = parse_header(literal)?;
-    let item = match descr {
+    let (descr, shape, header) = read_header(entry)?;
+    let item = match &descr[..] {
         "|u1" | "u1" | "<u1" | "|b1" => 1,
         "<u2" => 2,
         "<f4" => 4,
@@ -237,7 +222,6 @@ fn read_array(entry: &mut impl Read, size: u64) -> Result<(Vec<usize>, OwnedElem
         }
     };
     let expected = product(&shape).and_then(|n| n.checked_mul(item)).map(|n| n as u64);
-    let header = 8 + wide as u64 + length;
     if expected.is_none_or(|n| Some(header) != size.checked_sub(n)) {
         return Err(Error::format(format!("{size} bytes, expected shape {shape:?} of {item} bytes each")));
     }
@@ -253,6 +237,28 @@ fn read_array(entry: &mut impl Read, size: u64) -> Result<(Vec<usize>, OwnedElem
         _ => OwnedElements::F32(bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect()),
     };
     Ok((shape, elements))
+}
+
+/// Reads what stands before the elements of an `.npy`: their type, the shape, and how many bytes that took.
+pub(crate) fn read_header(npy: &mut impl Read) -> Result<(String, Vec<usize>, u64)> {
+    let failed = |e: io::Error| Error::format(format!("cannot be read: {e}"));
+    let mut start = [0u8; 8];
+    npy.read_exact(&mut start).map_err(failed)?;
+    if &start[..6] != b"\x93NUMPY" || !(1..=3).contains(&start[6]) {
+        return Err(Error::format(format!("starts with {start:02x?}, expected \\x93NUMPY and version 1 to 3")));
+    }
+    let wide = if start[6] == 1 { 2 } else { 4 };
+    let mut length = [0u8; 4];
+    npy.read_exact(&mut length[..wide]).map_err(failed)?;
+    let length = u64::from(u32::from_le_bytes(length));
+    if length > 1 << 16 {
+        return Err(Error::format(format!("header of {length} bytes, expected at most 65536")));
+    }
+    let mut literal = Vec::new();
+    npy.take(length).read_to_end(&mut literal).map_err(failed)?;
+    let literal = std::str::from_utf8(&literal).map_err(|_| Error::format("header is not text"))?;
+    let (descr, shape) = parse_header(literal)?;
+    Ok((descr.to_owned(), shape, 8 + wide as u64 + length))
 }
 
 /// The element type and shape of a header such as `{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }`.
