@@ -15,6 +15,7 @@ mod selftest;
 mod source;
 mod synth;
 mod terminal;
+mod view;
 
 use clap::{Args, Parser, Subcommand};
 use voxcast::{Error, ErrorKind, Isa, Result, Threads};
@@ -33,6 +34,7 @@ Examples:
   voxcast import epoch_24.pth --network nuscenes-200 -o model.safetensors
   voxcast rig scene/ --model model.safetensors -o rig.safetensors
   voxcast run --model model.safetensors --rig rig.safetensors scene/ -o out.npz --png out.png
+  voxcast view out.npz --scene scene/ -o out.html
   voxcast inspect model.safetensors
   voxcast eval --model model.safetensors --data synthetic:heldout
 
@@ -51,6 +53,8 @@ enum Command {
     Rig(rig::BuildRig),
     /// Run a model on a scene
     Run(run::Run),
+    /// Make a page of a result, to look at in a browser
+    View(view::View),
     /// Say what is in a model or a rig
     Inspect(inspect::Inspect),
     /// Time every operation of a model
@@ -72,6 +76,7 @@ impl Arguments {
             Command::Import(command) => command.run(),
             Command::Rig(command) => command.run(),
             Command::Run(command) => command.run(),
+            Command::View(command) => command.run(),
             Command::Inspect(command) => command.run(),
             Command::Profile(command) => command.run(),
             Command::Compare(command) => command.run(),

@@ -19,7 +19,7 @@ use crate::scene::Scene;
 use std::path::{Component, Path};
 
 /// Label of a voxel about which nothing is known, or which no score counts.
-pub const IGNORED: u8 = 255;
+pub const IGNORED: u8 = crate::labels::UNLABELLED;
 
 /// Where voxels lie: how many along each axis, and their metres in some frame of reference.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -96,7 +96,8 @@ import(&checkpoint, &network, Options::default(), Path::new("model.safetensors")
 //! | `cli` (default) | the program `voxcast`, and the others |
 //! | `import` | `checkpoint`: reading `.pth` and `.safetensors` |
 //! | `images` | `picture`, and JPEG and PNG in [`Scene::open`] and `Scene::save` |
-//! | `npz` | `npz`: NumPy's `.npz`, written and read |
+//! | `npz` | `npz`: NumPy's `.npz`, written and read; `labels`: label files, read |
+//! | `html` | `html`: results as a page to look at in a browser; with `images` and `npz` |
 //! | `capi` | the functions of `include/voxcast.h`, for C; see `docs/embedding.md` |
 //! | `eval` | `dataset` and `eval`: frames with labels, and scores; with `images` and `npz` |
 //!
@@ -121,8 +122,12 @@ pub mod eval;
 mod exec;
 pub mod graph;
 mod heap;
+#[cfg(feature = "html")]
+pub mod html;
 pub mod image;
 pub mod import;
+#[cfg(feature = "npz")]
+pub mod labels;
 pub mod model;
 pub mod network;
 #[cfg(feature = "npz")]

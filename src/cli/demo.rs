@@ -27,9 +27,10 @@ Examples:
   voxcast demo -o demo-out --threads 1                 (the same digest as with any other number of threads)
   voxcast demo -o demo-out --threads 1 --isa scalar    (the same digest again)
 
-It writes the scene with its labels, the model, the rig, occupancy.npz and occupancy.png.")]
+It writes the scene with its labels, the model, the rig, occupancy.npz, occupancy.png and demo.html, a page to look at in a
+browser: prediction, truth and difference as voxels to turn.")]
 pub struct Demo {
-    /// Directory for scene/, model, rig, occupancy and picture
+    /// Directory for scene/, model, rig, occupancy, picture and page
     #[arg(short, long, value_name = "DIR", default_value = "voxcast-demo")]
     output: PathBuf,
     /// Which street is drawn; the network was trained on 0 to 2419
@@ -83,9 +84,12 @@ impl Demo {
         println!("{score}");
         run::write(&directory.join("occupancy.npz"), network, &result, false)?;
         draw(&directory.join("occupancy.png"), network, &drawn, &result, &score)?;
+        let titles = ["voxcast demo", "a street that the network was not trained on"];
+        let page = directory.join("demo.html");
+        run::write_page(&page, network, &result, Some(&drawn.scene), Some(&drawn.labels), titles)?;
         let d = directory.display();
         println!(
-            "see {d}/occupancy.png; the same again: voxcast run --model {d}/model.safetensors {d}/scene -o out.npz"
+            "see {d}/occupancy.png and {d}/demo.html; the same again: voxcast run --model {d}/model.safetensors {d}/scene -o out.npz"
         );
         Ok(())
     }

@@ -1,12 +1,14 @@
 //! `voxcast run`
 
 use super::dump::Dump;
+use super::view::name_of;
 use super::{Machine, frame, terminal};
 use clap::Args;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use voxcast::html::Page;
 use voxcast::npz::{Array, Elements, write_npz};
 use voxcast::picture::{self, Figure, Palette};
 use voxcast::scene::forward_of;
@@ -19,11 +21,13 @@ use voxcast::{Error, Network, Result, Scene};
 Examples:
   voxcast run --model model.safetensors scene/ -o out.npz
   voxcast run --model model.safetensors --rig rig.safetensors scene/ -o out.npz --logits --png out.png
+  voxcast run --model model.safetensors scene/ -o out.npz --html out.html
   voxcast run --model model.safetensors scene/ -o out.npz --mask CAM_BACK,2
   voxcast run --model model.safetensors scene/ -o out.npz --dump stages/ --stages level1.volume,logits.lvl0
 
 In Python: numpy.load('out.npz')['classes'] is u8 [X, Y, Z], and ['support'] u16 [X, Y, Z] says by how many feature
 pixels each voxel is seen: where it is 0, no camera sees the place, and its class is a guess. Pictures hatch such places.
+['bounds'] f32 [3, 2] are the grid's metres, ['colours'] u8 [K, 3] those of the classes in pictures.
 Without --rig the matrices are built from the scene's calibration before the frame.
 The digest is the XXH3-64 of the classes; it is the same on any number of threads and any instruction set.")]
 pub struct Run {
@@ -35,7 +39,7 @@ pub struct Run {
     rig: Option<PathBuf>,
     /// A scene directory or .safetensors
     scene: PathBuf,
-    /// The .npz to write: `classes` u8 and `support` u16, both [X, Y, Z]
+    /// The .npz to write: `classes` u8 and `support` u16, both [X, Y, Z], `bounds` and `colours`
     #[arg(short, long, value_name = "OUT.npz")]
     output: PathBuf,
     /// Also write `logits` f32 [X, Y, Z, K]
@@ -44,6 +48,9 @@ pub struct Run {
     /// Draw images, bird's-eye view and voxels
     #[arg(long, value_name = "FILE")]
     png: Option<PathBuf>,
+    /// Write a page to look at in a browser: voxels to turn, and the images with the voxels on them
+    #[arg(long, value_name = "FILE")]
+    html: Option<PathBuf>,
     /// Leave cameras out, by name or number from 0, separated by commas: as if the rig had them not
     #[arg(long, value_name = "CAMERAS", value_delimiter = ',')]
     mask: Vec<String>,
@@ -67,7 +74,7 @@ pub struct Run {
 impl Run {
     pub fn run(self) -> Result<()> {
         let start = Instant::now();
-        for path in [Some(&self.output), self.png.as_ref()].into_iter().flatten() {
+        for path in [Some(&self.output), self.png.as_ref(), self.html.as_ref()].into_iter().flatten() {
             frame::check_output(path)?;
         }
         let (model, scene) = frame::open(&self.model, &self.scene)?;
@@ -111,6 +118,10 @@ impl Run {
         if let Some(path) = &self.png {
             draw(network, &scene, &result, &title(&self.model), "")?.write_png(path)?;
         }
+        if let Some(path) = &self.html {
+            let page = name_of(&self.output);
+            write_page(path, network, &result, Some(&scene), None, [&page, &title(&self.model)])?;
+        }
         if let (Some(dump), Some(directory)) = (dump, &self.dump) {
             dump.finish(directory, &rig, result.grid, result.classes)?;
         }
@@ -141,12 +152,33 @@ fn title(model: &Path) -> String {
 pub fn write(path: &Path, network: &Network, result: &Occupancy<'_>, logits: bool) -> Result<()> {
     let [x, y, z] = result.grid;
     let shape = [x, y, z, network.classes];
+    let colours: Vec<u8> = Palette::of(network.classes).classes().iter().flat_map(|c| c.rgb).collect();
+    let table = [network.classes, 3];
+    let colours = Array { name: "colours", shape: &table, elements: Elements::U8(&colours) };
     let mut arrays = vec![Array { name: "classes", shape: &shape[..3], elements: Elements::U8(result.classes) }];
     if let Some(values) = result.logits.filter(|_| logits) {
         arrays.push(Array { name: "logits", shape: &shape, elements: Elements::F32(values) });
     }
     arrays.push(Array { name: "support", shape: &shape[..3], elements: Elements::U16(result.support) });
+    arrays.push(Array { name: "bounds", shape: &[3, 2], elements: Elements::F32(network.bounds.as_flattened()) });
+    arrays.push(colours);
     write_npz(path, &arrays)
+}
+
+/// Writes a result, and the truth if there is one, as a page with a title and a subtitle.
+pub fn write_page(
+    path: &Path,
+    network: &Network,
+    result: &Occupancy<'_>,
+    scene: Option<&Scene>,
+    truth: Option<&[u8]>,
+    [title, subtitle]: [&str; 2],
+) -> Result<()> {
+    let palette = Palette::of(network.classes);
+    let prediction =
+        picture::Occupancy::new("", result.classes, result.grid, network.bounds, forward_of(&network.bounds))?
+            .with_support(result.support)?;
+    Page { title, subtitle, prediction, truth, scene, palette: &palette }.write(path)
 }
 
 /// The picture of a result.

@@ -46,12 +46,12 @@ const GREY: Rgb = [98, 104, 114];
 /// A grid of classes to draw, with its place in the world.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Occupancy<'a> {
-    caption: &'a str,
-    classes: &'a [u8],
-    grid: [usize; 3],
-    bounds: [[f32; 2]; 3],
-    forward: [f32; 2],
-    support: &'a [u16],
+    pub(crate) caption: &'a str,
+    pub(crate) classes: &'a [u8],
+    pub(crate) grid: [usize; 3],
+    pub(crate) bounds: [[f32; 2]; 3],
+    pub(crate) forward: [f32; 2],
+    pub(crate) support: &'a [u16],
 }
 
 impl<'a> Occupancy<'a> {

@@ -2,7 +2,8 @@
 
 use super::super::{Axes, Grid, IGNORED};
 use crate::error::{Error, Result};
-use crate::npz::{OwnedElements, read_npy_integers, read_npz};
+use crate::labels::read_rows;
+use crate::npz::{OwnedElements, read_npz};
 use crate::synth::CLASSES;
 use std::path::Path;
 
@@ -19,27 +20,9 @@ const FREE: u8 = 17;
 /// several rows for one voxel, the last holds.
 ///
 /// # Errors
-/// Those of [`read_npy_integers`]; [`ErrorKind::Format`](crate::ErrorKind::Format) for another shape and for what is
-/// outside the grid or the classes.
+/// Those of [`read_rows`].
 pub(super) fn read_surroundocc(path: &Path) -> Result<Vec<u8>> {
-    let (shape, numbers) = read_npy_integers(path)?;
-    let failed = |message: String| Error::format(message).in_file(path);
-    if !matches!(shape[..], [_, 4]) {
-        return Err(failed(format!("array of shape {shape:?}, expected [N, 4]")));
-    }
-    let mut labels = vec![0; SURROUNDOCC.voxels()];
-    let [nx, ny, nz] = SURROUNDOCC.size;
-    for (row, &[x, y, z, class]) in numbers.as_chunks::<4>().0.iter().enumerate() {
-        let index = |value: i64, end: usize| usize::try_from(value).ok().filter(|&i| i < end);
-        let (Some(x), Some(y), Some(z)) = (index(x, nx), index(y, ny), index(z, nz)) else {
-            return Err(failed(format!("row {row} is voxel ({x}, {y}, {z}), expected one of {nx} x {ny} x {nz}")));
-        };
-        let Some(class) = index(class, CLASSES.len()) else {
-            return Err(failed(format!("row {row} has class {class}, expected 0 to {}", CLASSES.len() - 1)));
-        };
-        labels[(x * ny + y) * nz + z] = if class == 0 { IGNORED } else { class as u8 };
-    }
-    Ok(labels)
+    read_rows(path, SURROUNDOCC.size, CLASSES.len())
 }
 
 /// Labels of Occ3D, and its masks of what the lidar has observed and of what the cameras have. "Others" (0) counts nowhere.

@@ -1,0 +1,145 @@
+//! `voxcast view`
+
+use super::{frame, import::read_network, terminal};
+use clap::Args;
+use std::path::{Path, PathBuf};
+use voxcast::html::Page;
+use voxcast::labels::read_labels;
+use voxcast::npz::{OwnedArray, OwnedElements, read_npz};
+use voxcast::picture::{Class, Occupancy, Palette};
+use voxcast::scene::forward_of;
+use voxcast::{Error, Network, Result, Scene};
+
+/// Make a page of a result, to look at in a browser.
+///
+/// The page is one file that needs nothing else and asks no network for anything: voxels to turn and to slice, classes to
+/// switch, what no camera sees, truth and difference, camera images with the voxels on them.
+#[derive(Args, Debug)]
+#[command(after_help = "\
+Examples:
+  voxcast view out.npz
+  voxcast view out.npz --scene scene/ --truth scene/labels.npz -o out.html
+  voxcast view classes.npz --network nuscenes-200    # of another program, which wrote no `bounds`
+
+Truth is `classes` u8 [X, Y, Z] in an .npz, 255 where there is no label, or integer rows x, y, z, class in an .npy, as
+SurroundOcc publishes them: there, rows of class 0 mark voxels without a label.")]
+pub struct View {
+    /// The result to show: `classes` u8 [X, Y, Z], as `voxcast run` writes it
+    #[arg(value_name = "OUT.npz")]
+    result: PathBuf,
+    /// The scene whose images to show: a directory or .safetensors
+    #[arg(long)]
+    scene: Option<PathBuf>,
+    /// Labels to compare with
+    #[arg(long, value_name = "LABELS")]
+    truth: Option<PathBuf>,
+    /// Where the .npz does not say it: whose bounds and classes these are, a built-in name or a network.json
+    #[arg(long, value_name = "NAME|FILE.json")]
+    network: Option<String>,
+    /// The page to write [default: OUT.html beside OUT.npz]
+    #[arg(short, long, value_name = "FILE.html")]
+    output: Option<PathBuf>,
+}
+
+impl View {
+    pub fn run(self) -> Result<()> {
+        let output = self.output.unwrap_or_else(|| self.result.with_extension("html"));
+        frame::check_output(&output)?;
+        let network = self.network.as_deref().map(read_network).transpose()?;
+        let stored = Stored::read(&self.result, network.as_ref()).map_err(|e| e.in_file(&self.result))?;
+        let scene = self.scene.as_deref().map(Scene::open).transpose()?;
+        let truth = self.truth.as_deref().map(|path| read_labels(path, stored.grid)).transpose()?;
+        let occupancy = stored.occupancy().map_err(|e| e.in_file(&self.result))?;
+        let page = Page {
+            title: &name_of(&self.result),
+            subtitle: &self.scene.as_deref().map(name_of).unwrap_or_default(),
+            prediction: occupancy,
+            truth: truth.as_deref(),
+            scene: scene.as_ref(),
+            palette: &stored.palette,
+        };
+        page.write(&output)?;
+        let length = std::fs::metadata(&output).map_or(0, |m| m.len());
+        println!("{} of {}, to open in a browser", output.display(), terminal::bytes(length as usize));
+        Ok(())
+    }
+}
+
+/// A file's own name.
+pub fn name_of(path: &Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
+/// What a result's file says, and a network where it does not.
+struct Stored {
+    classes: Vec<u8>,
+    support: Vec<u16>,
+    grid: [usize; 3],
+    bounds: [[f32; 2]; 3],
+    palette: Palette,
+}
+
+impl Stored {
+    fn read(path: &Path, network: Option<&Network>) -> Result<Self> {
+        let arrays = read_npz(path)?;
+        let find = |name: &str| arrays.iter().find(|a| a.name == name);
+        let (grid, classes) = match find("classes") {
+            Some(OwnedArray { shape, elements: OwnedElements::U8(classes), .. }) if shape.len() == 3 => {
+                ([shape[0], shape[1], shape[2]], classes.clone())
+            }
+            Some(other) => return Err(unfit(other, "u8 [X, Y, Z]")),
+            None => return Err(Error::format("no array \"classes\", expected u8 [X, Y, Z]")),
+        };
+        let support = match find("support") {
+            Some(OwnedArray { shape, elements: OwnedElements::U16(support), .. }) if *shape == grid => support.clone(),
+            Some(other) => return Err(unfit(other, &format!("u16 {grid:?}"))),
+            None => Vec::new(),
+        };
+        let bounds = match (network, find("bounds")) {
+            (Some(network), _) => network.bounds,
+            (None, Some(OwnedArray { shape, elements: OwnedElements::F32(b), .. })) if shape[..] == [3, 2] => {
+                [[b[0], b[1]], [b[2], b[3]], [b[4], b[5]]]
+            }
+            (None, Some(other)) => return Err(unfit(other, "f32 [3, 2]")),
+            (None, None) => {
+                let message = "no array \"bounds\", expected f32 [3, 2], or --network to say whose result this is";
+                return Err(Error::format(message));
+            }
+        };
+        let palette = match (network, find("colours")) {
+            (Some(network), _) => Palette::of(network.classes),
+            (None, Some(OwnedArray { shape, elements: OwnedElements::U8(rgb), .. }))
+                if shape.len() == 2 && (2..=256).contains(&shape[0]) && shape[1] == 3 =>
+            {
+                palette(rgb.as_chunks().0)
+            }
+            (None, Some(other)) => return Err(unfit(other, "u8 [K, 3] with 2 to 256 classes")),
+            (None, None) => {
+                let message = "no array \"colours\", expected u8 [K, 3], or --network to say whose result this is";
+                return Err(Error::format(message));
+            }
+        };
+        Ok(Self { classes, support, grid, bounds, palette })
+    }
+
+    fn occupancy(&self) -> Result<Occupancy<'_>> {
+        let occupancy = Occupancy::new("", &self.classes, self.grid, self.bounds, forward_of(&self.bounds))?;
+        if self.support.is_empty() { Ok(occupancy) } else { occupancy.with_support(&self.support) }
+    }
+}
+
+/// Classes of these colours; the names are those of the palette that has as many classes.
+fn palette(colours: &[[u8; 3]]) -> Palette {
+    let named = Palette::of(colours.len());
+    let classes = named.classes().iter().zip(colours);
+    Palette::new(classes.map(|(class, &rgb)| Class { name: class.name.clone(), rgb }).collect())
+}
+
+fn unfit(array: &OwnedArray, expected: &str) -> Error {
+    let kind = match array.elements {
+        OwnedElements::U8(_) => "u8",
+        OwnedElements::U16(_) => "u16",
+        OwnedElements::F32(_) => "f32",
+    };
+    Error::format(format!("array {:?} is {kind} {:?}, expected {expected}", array.name, array.shape))
+}
