@@ -12,6 +12,7 @@ mod rig;
 mod run;
 mod scoring;
 mod selftest;
+mod sequence;
 mod source;
 mod synth;
 mod terminal;

@@ -1,6 +1,7 @@
 //! `voxcast run`
 
 use super::dump::Dump;
+use super::sequence;
 use super::view::name_of;
 use super::{Machine, frame, terminal};
 use clap::Args;
@@ -16,6 +17,8 @@ use voxcast::session::{Occupancy, views};
 use voxcast::{Error, Network, Result, Scene};
 
 /// Run a model on a scene and write the class of every voxel.
+///
+/// A directory of scenes, such as a drive that `voxcast synth --frames` draws, is run with one session, in the order of names.
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Examples:
@@ -23,6 +26,7 @@ Examples:
   voxcast run --model model.safetensors --rig rig.safetensors scene/ -o out.npz --logits --png out.png
   voxcast run --model model.safetensors scene/ -o out.npz --html out.html
   voxcast run --model model.safetensors scene/ -o out.npz --mask CAM_BACK,2
+  voxcast run --model model.safetensors drive/ -o out/ --animation drive.png
   voxcast run --model model.safetensors scene/ -o out.npz --dump stages/ --stages level1.volume,logits.lvl0
 
 In Python: numpy.load('out.npz')['classes'] is u8 [X, Y, Z], and ['support'] u16 [X, Y, Z] says by how many feature
@@ -33,46 +37,63 @@ The digest is the XXH3-64 of the classes; it is the same on any number of thread
 pub struct Run {
     /// The model
     #[arg(long)]
-    model: PathBuf,
+    pub(super) model: PathBuf,
     /// The scene's matrices: made by `voxcast rig`, or plain CSR of another program
     #[arg(long)]
-    rig: Option<PathBuf>,
-    /// A scene directory or .safetensors
-    scene: PathBuf,
-    /// The .npz to write: `classes` u8 and `support` u16, both [X, Y, Z], `bounds` and `colours`
+    pub(super) rig: Option<PathBuf>,
+    /// A scene directory or .safetensors, or a directory of those
+    pub(super) scene: PathBuf,
+    /// The .npz to write, or of a sequence the directory for one per scene: `classes` u8 and `support` u16, both [X, Y, Z], `bounds` and `colours`
     #[arg(short, long, value_name = "OUT.npz")]
-    output: PathBuf,
+    pub(super) output: PathBuf,
     /// Also write `logits` f32 [X, Y, Z, K]
     #[arg(long)]
-    logits: bool,
+    pub(super) logits: bool,
     /// Draw images, bird's-eye view and voxels
     #[arg(long, value_name = "FILE")]
-    png: Option<PathBuf>,
+    pub(super) png: Option<PathBuf>,
     /// Write a page to look at in a browser: voxels to turn, and the images with the voxels on them
     #[arg(long, value_name = "FILE")]
-    html: Option<PathBuf>,
+    pub(super) html: Option<PathBuf>,
+    /// Of a sequence: draw images, map and voxels of every scene as one animated PNG
+    #[arg(long, value_name = "FILE.png")]
+    pub(super) animation: Option<PathBuf>,
+    /// Pictures of the animation per second
+    #[arg(long, value_name = "N", default_value_t = 4, requires = "animation", value_parser = clap::value_parser!(u16).range(1..=50))]
+    pub(super) rate: u16,
+    /// Width of the animation in pixels
+    #[arg(long, value_name = "PIXELS", default_value_t = 960, requires = "animation",
+        value_parser = clap::value_parser!(u16).range(160..=2400))]
+    pub(super) width: u16,
     /// Leave cameras out, by name or number from 0, separated by commas: as if the rig had them not
     #[arg(long, value_name = "CAMERAS", value_delimiter = ',')]
-    mask: Vec<String>,
+    pub(super) mask: Vec<String>,
     /// Write stages of the network to DIR/stages.safetensors, channels first
     #[arg(long, value_name = "DIR")]
-    dump: Option<PathBuf>,
+    pub(super) dump: Option<PathBuf>,
     /// Stages or operations to dump, separated by commas; for those that the projection fold removes, the network runs
     /// without it [default: every stage]
     #[arg(long, value_name = "NAMES", requires = "dump")]
     stages: Option<String>,
     /// Run without the projection fold, which rounds differently
     #[arg(long)]
-    unfolded: bool,
+    pub(super) unfolded: bool,
     /// Print the summary as JSON
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
     #[command(flatten)]
-    machine: Machine,
+    pub(super) machine: Machine,
 }
 
 impl Run {
     pub fn run(self) -> Result<()> {
+        if let Some(scenes) = sequence::scenes(&self.scene)? {
+            return self.run_sequence(&scenes);
+        }
+        if self.animation.is_some() {
+            let message = "--animation needs a directory of scenes, and this is one scene";
+            return Err(Error::mismatch(message).in_file(&self.scene));
+        }
         let start = Instant::now();
         for path in [Some(&self.output), self.png.as_ref(), self.html.as_ref()].into_iter().flatten() {
             frame::check_output(path)?;
@@ -132,7 +153,7 @@ impl Run {
 }
 
 /// The cameras that `names` are, each once.
-fn masked(names: &[String], scene: &Scene) -> Result<BTreeSet<usize>> {
+pub fn masked(names: &[String], scene: &Scene) -> Result<BTreeSet<usize>> {
     let find = |name: &String| {
         let number = || name.parse().ok().filter(|&camera| camera < scene.cameras());
         scene.names.iter().position(|n| n == name).or_else(number).ok_or_else(|| {
@@ -144,7 +165,7 @@ fn masked(names: &[String], scene: &Scene) -> Result<BTreeSet<usize>> {
 }
 
 /// A model's file name without its ending.
-fn title(model: &Path) -> String {
+pub fn title(model: &Path) -> String {
     model.file_stem().unwrap_or_default().to_string_lossy().into_owned()
 }
 

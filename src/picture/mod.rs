@@ -4,6 +4,7 @@
 //! legend with the share of each class. [`draw`] runs on one thread in a fixed order and calls no function whose result
 //! depends on the machine: equal input gives equal bytes.
 
+mod animation;
 mod bev;
 mod canvas;
 mod grid;
@@ -15,6 +16,7 @@ mod text;
 mod vehicle;
 mod voxels;
 
+pub use animation::Animation;
 pub use matrix::{Matrix, draw_matrix};
 pub use palette::{Class, Palette};
 pub use text::FONT_LICENSE;
