@@ -849,3 +849,99 @@ fn published_sets_are_scored() {
     assert!(line.contains("a model of 17 classes") && line.contains("has 20"), "{line}");
     refused("voxels/000000.invalid", &["eval", "--majority", &data, "--data", &data]);
 }
+
+/// A model for drawn streets, and a set of four of them.
+fn street_set(place: &Place) -> [String; 2] {
+    let street = Network { classes: 17, bounds: [[-20.0, 20.0], [-20.0, 20.0], [-5.3, 2.7]], ..network() };
+    fs::write(place.path("street"), small::model_bytes(&street, Precision::F32, Rewrites::ALL, 3)).unwrap();
+    fs::write(place.path("street.json"), street.to_json()).unwrap();
+    let [network, set, model] = ["street.json", "set", "street"].map(|f| place.text(f));
+    done(&["synth", "--network", &network, "--seed", "5", "--count", "4", "--set", &set]);
+    [model, format!("synthetic:{set}")]
+}
+
+#[test]
+fn an_evaluation_that_was_stopped_goes_on() {
+    let place = Place(tempfile::tempdir().unwrap());
+    let [model, data] = street_set(&place);
+    let [journal, json, markdown] = ["scores.jsonl", "scores.json", "scores.md"].map(|f| place.text(f));
+    let base = ["eval", "--model", &model, "--data", &data, "--losses"];
+    let at_once = done(&[&base[..], &["--json", &json, "--markdown", &markdown]].concat());
+    assert!(at_once.contains("4 frames") && at_once.contains("mIoU") && at_once.contains("lovasz"), "{at_once}");
+    let whole = fs::read(&json).unwrap();
+    assert!(fs::read_to_string(&markdown).unwrap().contains("| mIoU |"));
+
+    let resumed = [&base[..], &["--resume", &journal, "--json", &json, "--workers", "2"]].concat();
+    done(&[&resumed[..], &["--limit", "2"]].concat());
+    // The second frame's line loses its end, as after a kill.
+    let bytes = fs::read(&journal).unwrap();
+    assert_eq!(bytes.iter().filter(|&&b| b == b'\n').count(), 3);
+    fs::write(&journal, &bytes[..bytes.len() - 40]).unwrap();
+    assert_eq!(done(&resumed), at_once);
+    assert!(fs::read(&json).unwrap() == whole, "the same numbers to the last bit");
+    assert_eq!(fs::read_to_string(&journal).unwrap().lines().count(), 5);
+    // All is known: nothing is computed again, and the set's images are not needed.
+    let frame = place.path("set/000000007.safetensors");
+    let kept = fs::read(&frame).unwrap();
+    fs::write(&frame, "damaged").unwrap();
+    assert_eq!(done(&resumed), at_once);
+    fs::write(&frame, kept).unwrap();
+    let line = refused("scores.jsonl", &["eval", "--model", &model, "--data", &data, "--resume", &journal]);
+    assert!(line.contains("another evaluation"), "{line}");
+    fs::write(place.path("notes"), "my notes\n").unwrap();
+    refused("notes", &["eval", "--model", &model, "--data", &data, "--resume", &place.text("notes")]);
+    assert_eq!(fs::read_to_string(place.path("notes")).unwrap(), "my notes\n");
+}
+
+#[test]
+fn two_models_are_compared() {
+    let place = Place(tempfile::tempdir().unwrap());
+    let [model, data] = street_set(&place);
+    let street = Network::from_json(&fs::read_to_string(place.path("street.json")).unwrap()).unwrap();
+    fs::write(place.path("half"), small::model_bytes(&street, Precision::F16, Rewrites::ALL, 3)).unwrap();
+    let [half, json, picture] = ["half", "scores.json", "confusion.png"].map(|f| place.text(f));
+    let told = done(&["eval", "--compare", &model, &half, "--data", &data, "--json", &json, "--confusion", &picture]);
+    assert!(told.contains("B - A") && told.contains("say the same of"), "{told}");
+    let scores: Value = serde_json::from_slice(&fs::read(&json).unwrap()).unwrap();
+    let equal = scores["comparison"]["equal"].as_f64().unwrap();
+    assert!((0.5..1.0).contains(&equal), "f16 weights change some voxels and not all: {equal}");
+    let alone = |model: &str| -> Value {
+        done(&["eval", "--model", model, "--data", &data, "--json", &json]);
+        serde_json::from_slice(&fs::read(&json).unwrap()).unwrap()
+    };
+    assert_eq!([alone(&model), alone(&half)].to_vec(), scores["reports"].as_array().unwrap()[..]);
+    assert_eq!(&fs::read(place.path("confusion.png")).unwrap()[..4], b"\x89PNG");
+    assert_eq!(voxcast(&["eval", "--compare", &model, "--data", &data]).status.code(), Some(2));
+}
+
+#[test]
+fn a_drive_is_run_with_one_session() {
+    let place = Place::ready();
+    let street = Network { bounds: [[-20.0, 20.0], [-20.0, 20.0], [-5.3, 2.7]], ..network() };
+    fs::write(place.path("street.json"), street.to_json()).unwrap();
+    let [network, model, drive, out] = ["street.json", "model", "drive", "out"].map(|f| place.text(f));
+    done(&["synth", "--network", &network, "--seed", "5", "--frames", "3", "-o", &drive]);
+    let film = place.text("drive.png");
+    let run = ["run", "--model", &model, &drive, "-o", &out];
+    let told = done(&[&run[..], &["--animation", &film, "--width", "320", "--mask", "1"]].concat());
+    assert!(told.contains("3 scenes") && told.contains("99th percentile"), "{told}");
+    // The number of frames is in the animation's control chunk.
+    let bytes = fs::read(&film).unwrap();
+    let control = bytes.windows(4).position(|w| w == b"acTL").unwrap();
+    assert_eq!(bytes[control + 4..control + 8], [0, 0, 0, 3]);
+    for name in ["000", "001", "002"] {
+        let (scene, alone) = (format!("{drive}/{name}"), place.text("alone.npz"));
+        done(&["run", "--model", &model, &scene, "-o", &alone, "--mask", "1"]);
+        let one = fs::read(&alone).unwrap();
+        assert!(fs::read(place.path(&format!("out/{name}.npz"))).unwrap() == one, "{name} alone gives the same");
+    }
+    let summary: Value = serde_json::from_str(&done(&[&run[..], &["--json"]].concat())).unwrap();
+    assert_eq!(summary["scenes"].as_array().unwrap().len(), 3);
+    assert!(summary["seconds"]["frame"]["worst"].as_f64() >= summary["seconds"]["frame"]["median"].as_f64());
+    assert!(refused("drive", &[&run[..], &["--png", &film]].concat()).contains("--png shows one scene"));
+    let one = place.text("drive/000");
+    refused("000", &["run", "--model", &model, &one, "-o", &place.text("o.npz"), "--animation", &film]);
+    fs::write(place.path("drive/001/calibration.json"), "{}").unwrap();
+    refused("drive/001/calibration.json", &[&run[..], &["--animation", &film]].concat());
+    assert!(fs::read(&film).unwrap() == bytes, "the old animation stays");
+}
