@@ -506,7 +506,6 @@ fn a_large_grid_is_fluid() {
     for step in ["first", "second"] {
         let time: u32 = fact(&browser, "milliseconds").parse().unwrap();
         assert!(triangles(&browser) > 50_000 && time < 2000, "{step}: {} triangles, {time} ms", triangles(&browser));
-        println!("{} triangles in {time} ms", triangles(&browser));
         browser.click(&group(13));
         settle(&browser);
     }
