@@ -183,6 +183,9 @@ fn equal_input_gives_equal_bytes() {
     assert!(make() == make());
 }
 
+/// What is done to a sound scene.
+type Change = &'static dyn Fn(&mut Scene);
+
 #[test]
 fn what_does_not_fit_is_refused() {
     let refused = |truth: Option<&[u8]>, change: &dyn Fn(&mut Scene)| {
@@ -192,7 +195,7 @@ fn what_does_not_fit_is_refused() {
     };
     let error = refused(Some(&[0; 59]), &|_| ());
     assert_eq!((error.kind(), error.message()), (ErrorKind::Mismatch, "truth of 59 voxels, expected 60"));
-    let cases: [(&dyn Fn(&mut Scene), &str); 6] = [
+    let cases: [(Change, &str); 6] = [
         (&|s| s.names.truncate(1), "scene of 1 names, 2 images, 2 matrices"),
         (&|s| s.lidar2img.clear(), "scene of 2 names, 2 images, 0 matrices"),
         (&|s| s.lidar2img[0][7] = f32::NAN, "camera CAM_FRONT: lidar2img is not finite"),
