@@ -95,6 +95,7 @@ mod tests {
         assert_eq!(read(&npy("<i8", "(0, 4)", &[])).unwrap(), [0; 12]);
     }
 
+    #[cfg(feature = "images")]
     #[test]
     fn what_synth_writes_is_read_back() {
         let directory = tempfile::tempdir().unwrap();

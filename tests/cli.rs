@@ -222,9 +222,15 @@ fn the_whole_path() {
         assert_eq!(count.as_u64().unwrap() as usize, classes.iter().filter(|&&c| usize::from(c) == class).count());
     }
     assert_eq!((arrays[2].name.as_str(), &arrays[2].shape[..]), ("support", &[16, 24, 8][..]));
-    let support = |out: &str| match read_npz(Path::new(out)).unwrap().pop().unwrap().elements {
-        OwnedElements::U16(support) => support,
-        other => panic!("support is u16, not {other:?}"),
+    assert_eq!(arrays[3].name, "bounds");
+    assert_eq!(arrays[3].elements, OwnedElements::F32(network().bounds.concat()));
+    assert_eq!((arrays[4].name.as_str(), &arrays[4].shape[..]), ("colours", &[network().classes, 3][..]));
+    let support = |out: &str| {
+        let mut arrays = read_npz(Path::new(out)).unwrap().into_iter();
+        match arrays.find(|a| a.name == "support").unwrap().elements {
+            OwnedElements::U16(support) => support,
+            other => panic!("support is u16, not {other:?}"),
+        }
     };
     let all = support(&out);
     assert!(all.contains(&0) && all.iter().any(|&n| n > 1), "seen and unseen places");
@@ -235,17 +241,20 @@ fn the_whole_path() {
     assert_eq!(run(&["--mask", "CAM_1"])["digest"], masked["digest"], "by name");
     run(&["--mask", "0,1"]);
     assert!(support(&out).iter().all(|&n| n == 0));
-    let png = place.text("out.png");
+    let (png, html) = (place.text("out.png"), place.text("out.html"));
     for more in [
         &["--threads", "1"][..],
         &["--threads", "5", "--rig", &rig],
         &["--isa", "scalar"],
-        &["--png", &png],
+        &["--png", &png, "--html", &html],
         &["--dump", &dump, "--stages", "level1.fused,logits.lvl2"],
     ] {
         assert_eq!(run(more)["digest"], summary["digest"], "{more:?}");
     }
     assert!(fs::read(&png).unwrap().starts_with(b"\x89PNG"));
+    let page = page(&html);
+    assert_eq!((&page["title"], &page["digest"]), (&json!("out.npz"), &summary["digest"]));
+    assert_eq!((page["cameras"].as_array().unwrap().len(), page["classes"].as_array().unwrap().len()), (2, 19));
     run(&["--dump", &dump]);
     let stages = fs::read(place.path("dump/stages.safetensors")).unwrap();
     let stages = safetensors::SafeTensors::deserialize(&stages).unwrap();
@@ -287,13 +296,93 @@ fn the_demo_needs_no_other_file() {
     assert!(told.contains("mIoU") && again.contains(digest), "{again} {told}");
     assert_eq!(fs::read(file("occupancy.npz")).unwrap(), fs::read(&out).unwrap());
     assert!(fs::read(file("occupancy.png")).unwrap().starts_with(b"\x89PNG"));
+    let shown = page(&file("demo.html"));
+    assert_eq!((&shown["digest"], &shown["truth"]["caption"]), (&json!(digest), &json!("truth")));
+
+    // The same page from the files, but for its title.
+    let (result, labels, view) = (file("occupancy.npz"), file("scene/labels.npy"), file("view.html"));
+    done(&["view", &result, "--scene", &scene, "--truth", &labels, "-o", &view]);
+    let mut viewed = page(&view);
+    assert_eq!((&viewed["title"], &viewed["subtitle"]), (&json!("occupancy.npz"), &json!("scene")));
+    viewed["title"] = shown["title"].clone();
+    viewed["subtitle"] = shown["subtitle"].clone();
+    assert!(viewed == shown);
+}
+
+/// The data of a page.
+fn page(path: &str) -> Value {
+    let html = fs::read_to_string(path).unwrap();
+    let (_, json) = html.split_once("<script type=\"application/json\" id=\"data\">").unwrap();
+    serde_json::from_str(json.split_once("</script>").unwrap().0).unwrap()
+}
+
+#[test]
+fn pages_of_results() {
+    let place = tempfile::tempdir().unwrap();
+    let file = |name: &str| place.path().join(name).to_str().unwrap().to_owned();
+    let (classes, wide) = ([4u8; 24], [4u16; 24]);
+    let bounds = [-2.0f32, 2.0, 0.0, 3.0, -1.0, 1.0];
+    let array = |name, shape, elements| Array { name, shape, elements };
+    let good = [
+        array("classes", &[4, 3, 2], Elements::U8(&classes)),
+        array("bounds", &[3, 2], Elements::F32(&bounds)),
+        array("colours", &[8, 3], Elements::U8(&classes)),
+    ];
+    let out = file("out.npz");
+    let write = |arrays: &[Array<'_>]| write_npz(Path::new(&out), arrays).unwrap();
+
+    // Beside the result unless told otherwise; of another program, with the numbers of a network.
+    write(&good);
+    assert!(done(&["view", &out]).contains("out.html of "));
+    let shown = page(&file("out.html"));
+    assert_eq!(
+        (&shown["classes"][3], &shown["support"]),
+        (&json!({ "name": "class 3", "rgb": [4, 4, 4] }), &Value::Null)
+    );
+    assert_eq!(shown["bounds"], json!([[-2.0, 2.0], [0.0, 3.0], [-1.0, 1.0]]));
+    write(&good[..1]);
+    done(&["view", &out, "--network", "semantickitti-256"]);
+    let shown = page(&file("out.html"));
+    assert_eq!((&shown["classes"][4]["name"], &shown["bounds"][0]), (&json!("truck"), &json!([0.0, 51.2])));
+    fs::remove_file(file("out.html")).unwrap();
+
+    for (arrays, expected) in [
+        (vec![], "no array \"classes\", expected u8 [X, Y, Z]"),
+        (vec![array("classes", &[4, 6], Elements::U8(&classes))], "\"classes\" is u8 [4, 6], expected u8 [X, Y, Z]"),
+        (vec![array("classes", &[4, 3, 2], Elements::U16(&wide))], "\"classes\" is u16 [4, 3, 2]"),
+        (vec![array("classes", &[4, 0, 2], Elements::U8(&[])), good[1], good[2]], "at least one voxel"),
+        (good[..1].to_vec(), "no array \"bounds\", expected f32 [3, 2], or --network"),
+        (good[..2].to_vec(), "no array \"colours\", expected u8 [K, 3], or --network"),
+        (vec![good[0], array("bounds", &[2, 3], Elements::F32(&bounds)), good[2]], "\"bounds\" is f32 [2, 3]"),
+        (vec![good[0], array("bounds", &[3, 2], Elements::F32(&[f32::NAN; 6])), good[2]], "bounds [NaN, NaN] on x"),
+        (vec![good[0], good[1], array("colours", &[6, 4], Elements::U8(&classes))], "\"colours\" is u8 [6, 4]"),
+        (vec![good[0], good[1], good[2], array("support", &[24], Elements::U16(&wide))], "\"support\" is u16 [24]"),
+    ] {
+        write(&arrays);
+        let line = refused(&out, &["view", &out]);
+        assert!(line.contains(expected), "{line}");
+    }
+    fs::write(&out, b"no zip").unwrap();
+    refused(&out, &["view", &out]);
+    refused(&file("none"), &["view", &file("none")]);
+    write(&good);
+    refused(&file("none"), &["view", &out, "--scene", &file("none")]);
+    refused(&file("none"), &["view", &out, "--truth", &file("none")]);
+    refused(&file("no/out.html"), &["view", &out, "-o", &file("no/out.html")]);
+    let truth = file("truth.npz");
+    write_npz(Path::new(&truth), &[array("classes", &[2, 3, 4], Elements::U8(&classes))]).unwrap();
+    let line = refused(&truth, &["view", &out, "--truth", &truth]);
+    assert!(line.contains("shape [2, 3, 4], expected [4, 3, 2]"), "{line}");
+    assert!(!Path::new(&file("out.html")).exists(), "nothing is written on failure");
 }
 
 #[test]
 fn help_and_usage() {
     assert!(done(&["--version"]).starts_with("voxcast "));
     let help = done(&["--help"]);
-    for command in ["compare", "demo", "eval", "import", "inspect", "profile", "rig", "run", "selftest", "synth"] {
+    for command in
+        ["compare", "demo", "eval", "import", "inspect", "profile", "rig", "run", "selftest", "synth", "view"]
+    {
         assert!(help.contains(command));
         assert!(done(&[command, "--help"]).contains("Examples:"), "{command}");
         assert!(done(&["help", command]).contains("Usage:"), "{command}");
@@ -322,6 +411,7 @@ fn help_and_usage() {
         &["eval", "--data", "synthetic:d"],
         &["eval", "--model", "m", "--data", "occ3d:d"],
         &["eval", "--model", "m", "--data", "semantickitti:d:22"],
+        &["view"],
     ] {
         let output = voxcast(bad);
         assert_eq!((output.status.code(), output.stdout.is_empty()), (Some(2), true), "{bad:?}");

@@ -270,6 +270,8 @@ function Space(T, context) {
     this.ground = new T.Mesh(plate, new T.MeshBasicMaterial({ map: this.groundTexture }));
     this.ground.position.set(middle[0], middle[1], floor - 0.02 * edge[2]);
 
+    // In a grid that is hardly larger than it, or lies elsewhere, the vehicle would hide the rest.
+    this.around = [0, 1].every((a) => low[a] <= 0 && high[a] >= 0 && high[a] - low[a] > 12);
     this.vehicle = vehicle(T);
     this.frusta = new T.LineSegments(frusta(T), new T.LineBasicMaterial({ color: 0x2f7df6 }));
     this.marker = new T.LineSegments(box(T), new T.LineBasicMaterial({ color: 0xffffff, depthTest: false }));
@@ -284,6 +286,7 @@ function Space(T, context) {
     this.draw = () => {
         if (this.pending) return;
         this.pending = true;
+        canvas.dataset.resting = "false";
         requestAnimationFrame((now) => {
             this.pending = false;
             this.frame(now);
@@ -299,11 +302,12 @@ function Space(T, context) {
         const { camera } = this;
         // What stands at the cameras would be in the way of one who looks from there.
         const inside = Math.hypot(camera.position.x, camera.position.y, camera.position.z - road) < 4;
-        this.vehicle.visible = this.frusta.visible = !inside && road < high[2];
+        this.vehicle.visible = this.frusta.visible = !inside && this.around;
         const height = this.renderer.domElement.height;
         this.uniforms.pixel.value = 0.35 * 2 * Math.tan(camera.fov * Math.PI / 360) / height / Math.min(...edge);
         this.renderer.render(this.scene, camera);
         canvas.dataset.camera = [...camera.position.toArray(), ...this.controls.target.toArray()].map((v) => v.toFixed(3)).join(" ");
+        canvas.dataset.resting = !this.pending;
     };
     /** Goes to a place and looks at another, in under half a second unless the reader wants no motion. */
     this.fly = (position, target, field = FIELD) => {
@@ -536,11 +540,13 @@ function show() {
     canvas.dataset.milliseconds = Math.round(performance.now() - start);
     // Images can wait until the reader's hand rests.
     clearTimeout(later);
+    canvas.dataset.laid = "false";
     later = setTimeout(layImages, 60);
 }
 
 function layImages() {
     for (const { overlay } of images) overlay.hidden = !state.overlay;
+    canvas.dataset.laid = "true";
     if (!state.overlay || images.length === 0) return;
     const found = surface(shown, size, low, edge);
     const list = new Uint32Array(colours().map(([r, g, b]) => (255 << 24 | b << 16 | g << 8 | r) >>> 0));
@@ -737,7 +743,9 @@ function fillCameras() {
             stage.scrollIntoView({ block: "nearest", behavior: "smooth" });
         });
         images.push({ camera, overlay, button });
-        $("images").append(make("li", {}, button));
+        const item = make("li", {}, button);
+        item.style.setProperty("--aspect", camera.width / camera.height);
+        $("images").append(item);
     }
     $("overlay").addEventListener("change", () => {
         state.overlay = $("overlay").checked;
