@@ -45,6 +45,12 @@ fn bounded(arguments: &[&str]) -> Output {
     if !cfg!(target_os = "linux") {
         return voxcast(arguments);
     }
+    // A sanitizer reserves more address space than there is memory; it has a limit of its own.
+    if let Ok(options) = std::env::var("ASAN_OPTIONS") {
+        let options = format!("{options}:hard_rss_limit_mb={}", KILOBYTES >> 10);
+        let mut command = Command::new(env!("CARGO_BIN_EXE_voxcast"));
+        return command.args(arguments).env("ASAN_OPTIONS", options).output().unwrap();
+    }
     let script = format!("ulimit -v {KILOBYTES}; exec \"$0\" \"$@\"");
     let program = env!("CARGO_BIN_EXE_voxcast");
     Command::new("sh").args(["-c", &script, program]).args(arguments).output().unwrap()

@@ -167,7 +167,7 @@ proptest! {
         let rig = small::rig(&network, 0.3);
         let images = Images::new(&network, seed);
         let logits = |rewrites, unfolded| {
-            let model = small::model(&network, Precision::F32, rewrites, seed);
+            let model = small::tempered(&network, rewrites, seed);
             let options = SessionOptions { logits: true, unfolded, ..SessionOptions::default() };
             let mut session = Session::new(model, rig.clone(), &options).unwrap();
             session.run(&images.views()).unwrap().logits.unwrap().to_vec()

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 use voxcast::graph::Rewrites;
-use voxcast::import::import;
+use voxcast::import::{Source, import};
 use voxcast::model::Options;
 use voxcast::network::{Block, Sampling};
 use voxcast::random::Random;
@@ -12,7 +12,7 @@ use voxcast::{ImageView, Isa, Model, Network, Rig};
 
 #[path = "weights.rs"]
 mod weights;
-pub(crate) use weights::Weights;
+pub(crate) use weights::{Tempered, Weights};
 
 /// A network with odd sizes wherever sizes are free: channels that fill no vector, X != Y, windows that need padding.
 pub(crate) fn network() -> Network {
@@ -37,14 +37,24 @@ pub(crate) fn network() -> Network {
 
 /// A model file in memory.
 pub(crate) fn model_bytes(network: &Network, precision: Precision, rewrites: Rewrites, seed: u64) -> Vec<u8> {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join("model");
-    import(&Weights(seed), network, Options { precision, rewrites }, &path, &mut |_, _| ()).unwrap();
-    std::fs::read(&path).unwrap()
+    bytes_of(&Weights(seed), network, Options { precision, rewrites })
 }
 
 pub(crate) fn model(network: &Network, precision: Precision, rewrites: Rewrites, seed: u64) -> Arc<Model> {
     Arc::new(Model::from_bytes(model_bytes(network, precision, rewrites, seed)).unwrap())
+}
+
+/// A model in f32 whose softmaxes weigh tokens rather than choose one, so that rounding stays as small as it is.
+pub(crate) fn tempered(network: &Network, rewrites: Rewrites, seed: u64) -> Arc<Model> {
+    let options = Options { precision: Precision::F32, rewrites };
+    Arc::new(Model::from_bytes(bytes_of(&Tempered(seed), network, options)).unwrap())
+}
+
+fn bytes_of(weights: &impl Source, network: &Network, options: Options) -> Vec<u8> {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("model");
+    import(weights, network, options, &path, &mut |_, _| ()).unwrap();
+    std::fs::read(&path).unwrap()
 }
 
 /// Pinhole cameras that look outwards, turned by `turn` radians.
