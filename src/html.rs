@@ -1,7 +1,7 @@
 //! A result as one HTML page that needs nothing else: voxels to turn, truth beside prediction, camera images.
 //!
 //! The page opens from a disk, without a network: it holds the grids, the images and its own program, and its content
-//! security policy forbids every request. `src/html/` is that program: `viewer.html` with `viewer.css`; `mesh.js`, which
+//! security policy lets nothing be loaded and no form be sent. `src/html/` is that program: `viewer.html` with `viewer.css`; `mesh.js`, which
 //! makes triangles of voxels; `cameras.js`, which lays voxels over images; `viewer.js`, which answers the reader. three.js
 //! (`assets/viewer/`) draws.
 //!
@@ -10,6 +10,7 @@
 
 use crate::digest;
 use crate::error::{Error, Result};
+use crate::labels::UNLABELLED;
 use crate::picture::{Occupancy, Palette};
 use crate::replace::replace_file;
 use crate::scene::{Image, Scene};
@@ -48,8 +49,7 @@ pub struct Page<'a> {
     pub subtitle: &'a str,
     /// What was predicted; its support tells "free" and "unknown" apart. Its caption names it, "prediction" if empty.
     pub prediction: Occupancy<'a>,
-    /// The class of every voxel in truth, z fastest, on the grid of the prediction. 255, and classes that the palette does
-    /// not have, mark voxels without a label.
+    /// The class of every voxel in truth, z fastest, on the grid of the prediction; 255 marks voxels without a label.
     pub truth: Option<&'a [u8]>,
     /// The images that the prediction was made of.
     pub scene: Option<&'a Scene>,
@@ -112,7 +112,8 @@ impl Page<'_> {
     /// The page: some 250 kB, and what grids and images take when they are compressed.
     ///
     /// # Errors
-    /// [`ErrorKind::Mismatch`](crate::ErrorKind::Mismatch) when the truth has not as many voxels as the prediction;
+    /// [`ErrorKind::Mismatch`](crate::ErrorKind::Mismatch) when the truth has not as many voxels as the prediction, when
+    /// either has a class that the palette has not, and for a palette of more than 255 classes;
     /// [`ErrorKind::Format`](crate::ErrorKind::Format), naming the camera, for a scene whose names, images and matrices are
     /// not as many, for an image whose bytes do not fit its size, and for a matrix that is not finite.
     pub fn to_html(&self) -> Result<String> {
@@ -120,6 +121,12 @@ impl Page<'_> {
         if let Some(truth) = self.truth.filter(|t| t.len() != voxels) {
             return Err(Error::mismatch(format!("truth of {} voxels, expected {voxels}", truth.len())));
         }
+        let known = self.palette.classes().len();
+        if known > usize::from(UNLABELLED) {
+            return Err(Error::mismatch(format!("{known} classes, expected at most {UNLABELLED}")));
+        }
+        check_classes("prediction", self.prediction.classes, known, false)?;
+        check_classes("truth", self.truth.unwrap_or_default(), known, true)?;
         let caption = match self.prediction.caption {
             "" => "prediction",
             caption => caption,
@@ -152,6 +159,16 @@ impl Page<'_> {
             _ => PROGRAM.concat(),
         }))
     }
+}
+
+/// Refuses classes that have no name and no colour.
+fn check_classes(what: &str, classes: &[u8], known: usize, unlabelled: bool) -> Result<()> {
+    let fits = |class: u8| usize::from(class) < known || (unlabelled && class == UNLABELLED);
+    let Some(first) = classes.iter().position(|&class| !fits(class)) else { return Ok(()) };
+    let found = classes[first];
+    let count = classes.iter().filter(|&&class| class == found).count();
+    let message = format!("{what}: {count} voxels of class {found}, the first at {first}, expected 0 to {}", known - 1);
+    Err(Error::mismatch(message))
 }
 
 /// The template with a text for each `{{NAME}}`. What is put in is not searched again.

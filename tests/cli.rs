@@ -346,10 +346,16 @@ fn pages_of_results() {
         (&json!({ "name": "class 3", "rgb": [4, 4, 4] }), &Value::Null)
     );
     assert_eq!(shown["bounds"], json!([[-2.0, 2.0], [0.0, 3.0], [-1.0, 1.0]]));
-    write(&good[..1]);
-    done(&["view", &out, "--network", "semantickitti-256"]);
+    // Of another program, with the numbers of a network, unless the file says others.
+    let (network, json) = (network(), file("network.json"));
+    fs::write(&json, network.to_json()).unwrap();
+    let grid = network.output_grid();
+    let many = vec![4u8; grid.iter().product()];
+    let foreign = array("classes", &grid, Elements::U8(&many));
+    write(&[foreign]);
+    done(&["view", &out, "--network", &json]);
     let shown = page(&file("out.html"));
-    assert_eq!((&shown["classes"][4]["name"], &shown["bounds"][0]), (&json!("truck"), &json!([0.0, 51.2])));
+    assert_eq!((shown["classes"].as_array().unwrap().len(), &shown["bounds"]), (19, &json!(network.bounds)));
     fs::remove_file(file("out.html")).unwrap();
 
     for (arrays, expected) in [
@@ -368,6 +374,13 @@ fn pages_of_results() {
         let line = refused(&out, &["view", &out]);
         assert!(line.contains(expected), "{line}");
     }
+    write(&[foreign, good[1], good[2]]);
+    assert!(refused(&out, &["view", &out, "--network", &json]).contains("those of --network are"));
+    write(&good);
+    assert!(refused(&out, &["view", &out, "--network", &json]).contains("a grid of [4, 3, 2]"));
+    write(&[good[0], good[1], array("colours", &[4, 3], Elements::U8(&classes[..12]))]);
+    let line = refused(&out, &["view", &out]);
+    assert!(line.contains("prediction: 24 voxels of class 4, the first at 0, expected 0 to 3"), "{line}");
     fs::write(&out, b"no zip").unwrap();
     refused(&out, &["view", &out]);
     refused(&file("none"), &["view", &file("none")]);

@@ -58,7 +58,7 @@ impl View {
             scene: scene.as_ref(),
             palette: &stored.palette,
         };
-        page.write(&output)?;
+        page.write(&output).map_err(|e| if e.path().is_some() { e } else { e.in_file(&self.result) })?;
         let length = std::fs::metadata(&output).map_or(0, |m| m.len());
         println!("{} of {}, to open in a browser", output.display(), terminal::bytes(length as usize));
         Ok(())
@@ -95,30 +95,43 @@ impl Stored {
             Some(other) => return Err(unfit(other, &format!("u16 {grid:?}"))),
             None => Vec::new(),
         };
-        let bounds = match (network, find("bounds")) {
-            (Some(network), _) => network.bounds,
-            (None, Some(OwnedArray { shape, elements: OwnedElements::F32(b), .. })) if shape[..] == [3, 2] => {
+        if let Some(network) = network.filter(|network| network.output_grid() != grid) {
+            let message = format!("a grid of {grid:?}, that of --network has {:?}", network.output_grid());
+            return Err(Error::mismatch(message));
+        }
+        let bounds = match (find("bounds"), network) {
+            (Some(OwnedArray { shape, elements: OwnedElements::F32(b), .. }), _) if shape[..] == [3, 2] => {
                 [[b[0], b[1]], [b[2], b[3]], [b[4], b[5]]]
             }
-            (None, Some(other)) => return Err(unfit(other, "f32 [3, 2]")),
+            (Some(other), _) => return Err(unfit(other, "f32 [3, 2]")),
+            (None, Some(network)) => network.bounds,
             (None, None) => {
                 let message = "no array \"bounds\", expected f32 [3, 2], or --network to say whose result this is";
                 return Err(Error::format(message));
             }
         };
-        let palette = match (network, find("colours")) {
-            (Some(network), _) => Palette::of(network.classes),
-            (None, Some(OwnedArray { shape, elements: OwnedElements::U8(rgb), .. }))
-                if shape.len() == 2 && (2..=256).contains(&shape[0]) && shape[1] == 3 =>
+        let palette = match (find("colours"), network) {
+            (Some(OwnedArray { shape, elements: OwnedElements::U8(rgb), .. }), _)
+                if shape.len() == 2 && (2..=255).contains(&shape[0]) && shape[1] == 3 =>
             {
                 palette(rgb.as_chunks().0)
             }
-            (None, Some(other)) => return Err(unfit(other, "u8 [K, 3] with 2 to 256 classes")),
+            (Some(other), _) => return Err(unfit(other, "u8 [K, 3] with 2 to 255 classes")),
+            (None, Some(network)) => Palette::of(network.classes),
             (None, None) => {
                 let message = "no array \"colours\", expected u8 [K, 3], or --network to say whose result this is";
                 return Err(Error::format(message));
             }
         };
+        if let Some(network) = network.filter(|n| n.bounds != bounds || n.classes != palette.classes().len()) {
+            let message = format!(
+                "bounds {bounds:?} and {} classes, those of --network are {:?} and {}",
+                palette.classes().len(),
+                network.bounds,
+                network.classes
+            );
+            return Err(Error::mismatch(message));
+        }
         Ok(Self { classes, support, grid, bounds, palette })
     }
 

@@ -44,64 +44,23 @@ function corners({ at, ahead, down, right, centre, focal }, { width, height }) {
     });
 }
 
-/** Bordered indices and centres in metres of the shown voxels that have a side open. */
-function surface(shown, size, low, edge) {
-    const step = strides(size);
-    const found = { at: [], centres: [] };
-    for (let x = 0; x < size[0]; x++) {
-        for (let y = 0; y < size[1]; y++) {
-            let at = (x + 1) * step[0] + (y + 1) * step[1] + 1;
-            for (let z = 0; z < size[2]; z++, at++) {
-                if (!shown[at]) continue;
-                const inside = shown[at - 1] && shown[at + 1] && shown[at - step[1]] && shown[at + step[1]]
-                    && shown[at - step[0]] && shown[at + step[0]];
-                if (inside) continue;
-                found.at.push(at);
-                found.centres.push(low[0] + (x + 0.5) * edge[0], low[1] + (y + 0.5) * edge[1], low[2] + (z + 0.5) * edge[2]);
-            }
-        }
-    }
-    return found;
-}
-
 /**
- * Draws the centre of each voxel of a surface as a square that shrinks with the distance, the nearest on top. `colours` are
- * 32-bit pixels per group. Returns how many voxels are in the picture.
+ * The camera's matrix as one of clip space, sixteen numbers row by row: it takes metres to the camera's picture, and depths
+ * from `near` to `far` metres to -1 to 1; null for a matrix that no camera has.
  */
-function lay(canvas, camera, { at, centres }, shown, colours, edge) {
-    const [w, h] = [canvas.width, canvas.height];
-    const context = canvas.getContext("2d");
-    const picture = context.createImageData(w, h);
-    const pixels = new Uint32Array(picture.data.buffer);
-    const depths = new Float32Array(w * h).fill(Infinity);
-    const m = camera.lidar2img;
-    const scale = [w / camera.width, h / camera.height];
-    const stand = pose(camera);
-    const focal = stand ? stand.focal[0] * scale[0] : w;
-    const metric = stand ? 1 / Math.hypot(m[8], m[9], m[10]) : 1;
-    let count = 0;
-    for (let n = 0; n < at.length; n++) {
-        const [x, y, z] = [centres[3 * n], centres[3 * n + 1], centres[3 * n + 2]];
-        const d = m[8] * x + m[9] * y + m[10] * z + m[11];
-        if (!(d * metric > 0.5)) continue;
-        const u = (m[0] * x + m[1] * y + m[2] * z + m[3]) / d * scale[0];
-        const v = (m[4] * x + m[5] * y + m[6] * z + m[7]) / d * scale[1];
-        if (!(u >= 0 && u < w && v >= 0 && v < h)) continue;
-        count++;
-        const half = Math.min(Math.max(0.28 * edge * focal / (d * metric), 0.8), 9);
-        const colour = colours[shown[at[n]] & 255];
-        const [left, right] = [Math.max(0, Math.round(u - half)), Math.min(w, Math.round(u + half))];
-        const [top, bottom] = [Math.max(0, Math.round(v - half)), Math.min(h, Math.round(v + half))];
-        for (let row = top; row < bottom; row++) {
-            for (let to = row * w + left; to < row * w + right; to++) {
-                if (d < depths[to]) {
-                    depths[to] = d;
-                    pixels[to] = colour;
-                }
-            }
-        }
-    }
-    context.putImageData(picture, 0, 0);
-    return count;
+function projection({ lidar2img: m, width, height }, near, far) {
+    const unit = Math.hypot(m[8], m[9], m[10]);
+    if (!(unit > 1e-12)) return null;
+    const row = (r) => m.slice(4 * r, 4 * r + 4);
+    const [u, v, d] = [row(0), row(1), row(2)];
+    // Depths in the matrix's own unit, which need not be a metre.
+    const [from, to] = [near * unit, far * unit];
+    const depth = d.map((value) => value * (to + from) / (to - from));
+    depth[3] -= 2 * to * from / (to - from);
+    return [
+        ...u.map((value, k) => 2 * value / width - d[k]),
+        ...v.map((value, k) => d[k] - 2 * value / height),
+        ...depth,
+        ...d,
+    ];
 }
-

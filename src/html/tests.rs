@@ -146,7 +146,8 @@ fn nothing_is_asked_of_a_network() {
     // Hostile names hold what would be requests, were they not text.
     let plain = Scene { names: vec!["CAM_FRONT".into(), "CAM_BACK".into()], ..scene() };
     let html = page(None, Some(&plain), "out.npz", &Palette::of(17)).unwrap();
-    let policy = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:";
+    let policy = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; \
+                  base-uri 'none'; form-action 'none'";
     assert!(html.contains(&format!("<meta http-equiv=\"Content-Security-Policy\" content=\"{policy}\">")));
     let mut three = String::new();
     GzDecoder::new(THREE).read_to_string(&mut three).unwrap();

@@ -1,7 +1,7 @@
 // The page: reads its data, shows the voxels, and does what the reader asks.
 //
 // `state` is all that the reader can choose. Every change goes through `show`, which makes the shown grid of it, triangles of
-// that, and the squares on the images. Frames are drawn only when something has changed.
+// that, and pictures of those for the images. Frames are drawn only when something has changed.
 
 const $ = (id) => document.getElementById(id);
 
@@ -20,10 +20,18 @@ async function unpack(text, format) {
     return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** Says on the page, in place of the voxels, why they are not there. */
+/** Says on the page, in place of the voxels, why they are not there; nothing if they are. */
 function tell(text) {
-    $("message").hidden = false;
+    $("message").hidden = text === "";
     $("message").textContent = text;
+}
+
+// A page that stays empty should at least say why. The first reason is the one that matters.
+for (const kind of ["error", "unhandledrejection"]) {
+    window.addEventListener(kind, (event) => {
+        const reason = event.message || event.reason;
+        if (reason && $("message").hidden) tell(`This page failed: ${reason}`);
+    });
 }
 
 // --- Data ---------------------------------------------------------------------------------------------------------------
@@ -45,29 +53,28 @@ if (typeof DecompressionStream === "undefined") {
 }
 
 const UNLABELLED = 255;
-const known = data.classes.length;
-const prediction = (await unpack(data.prediction.classes, "deflate")).map((c) => (c < known ? c : 0));
-const truth = data.truth && (await unpack(data.truth.classes, "deflate")).map((c) => (c < known ? c : UNLABELLED));
+const prediction = await unpack(data.prediction.classes, "deflate");
+const truth = data.truth && (await unpack(data.truth.classes, "deflate"));
 const support = data.support && new Uint16Array((await unpack(data.support, "deflate")).buffer);
 
-/** Kinds of difference, in the order of their groups from 1 on. */
+/** Kinds of difference, in the order of their groups from 1 on; red-green blindness leaves their colours apart. */
 const DIFFERENCES = [
-    { name: "right", note: "the class is that of the truth", rgb: [58, 166, 106] },
-    { name: "wrong class", note: "occupied, but by something else", rgb: [240, 178, 40] },
-    { name: "missed", note: "in the truth only", rgb: [54, 122, 232] },
-    { name: "invented", note: "in the prediction only", rgb: [222, 66, 60] },
+    { name: "right", note: "the class is that of the truth", rgb: [0, 158, 115] },
+    { name: "wrong class", note: "occupied, but by something else", rgb: [240, 190, 40] },
+    { name: "missed", note: "in the truth only", rgb: [0, 114, 178] },
+    { name: "invented", note: "in the prediction only", rgb: [204, 90, 150] },
 ];
 const UNKNOWN = [128, 136, 150];
 
 /** The kind of difference of a voxel, 0 where there is nothing to compare. */
 function difference(index) {
     const [said, is] = [prediction[index], truth[index]];
-    if ((is === UNLABELLED && known <= UNLABELLED) || (said === 0 && is === 0)) return 0;
+    if (is === UNLABELLED || (said === 0 && is === 0)) return 0;
     if (said === is) return 1;
     return said === 0 ? 3 : is === 0 ? 4 : 2;
 }
 
-const occupied = (classes) => classes.map((c) => (c === UNLABELLED && known <= UNLABELLED ? 0 : c));
+const occupied = (classes) => classes.map((c) => (c === UNLABELLED ? 0 : c));
 const classGroups = data.classes.map((c, k) => ({ ...c, group: k })).slice(1);
 
 /** What can be shown: a caption, the group of every voxel, and the groups' names and colours. */
@@ -84,19 +91,19 @@ for (const layer of layers) {
     layer.off = layer.key === "truth" ? layers[0].off : new Set();
 }
 
-const state = { layer: layers[0], low: 0, high: size[2], unseen: "hatched", unknown: false, overlay: true };
+const state = { layer: layers[0], low: 0, high: size[2], unseen: "hatched", unknown: false, overlay: true, view: "home" };
 
 const thousands = (n) => n.toLocaleString("en").replaceAll(",", "\u2009");
 const percent = (part, whole) => (whole === 0 ? "–" : `${(100 * part / whole).toFixed(1)} %`);
 const metres = (v) => (Math.abs(v) < 0.005 ? 0 : v).toFixed(2).replace("-", "−");
 
 /** IoU of "occupied" and mIoU over the classes from 1 on that are in either, in words. */
-function score() {
+const score = truth && (() => {
     const [both, said, is] = [new Float64Array(256), new Float64Array(256), new Float64Array(256)];
     let [shared, union] = [0, 0];
     for (let i = 0; i < truth.length; i++) {
         const [p, t] = [prediction[i], truth[i]];
-        if (t === UNLABELLED && known <= UNLABELLED) continue;
+        if (t === UNLABELLED) continue;
         said[p]++;
         is[t]++;
         if (p === t) both[p]++;
@@ -106,7 +113,7 @@ function score() {
     const ious = classGroups.map(({ group: g }) => [both[g], said[g] + is[g] - both[g]]).filter(([, whole]) => whole > 0);
     const mean = ious.reduce((sum, [part, whole]) => sum + part / whole, 0);
     return `IoU ${percent(shared, union)}, mIoU ${percent(mean, ious.length)}`;
-}
+})();
 
 // --- The shown grid -----------------------------------------------------------------------------------------------------
 
@@ -182,6 +189,7 @@ in vec4 place;
 uniform mat4 modelViewMatrix, projectionMatrix;
 uniform sampler2D palette;
 uniform float pixel;
+uniform float alone;
 out vec3 at;
 out vec3 colour;
 flat out int side;
@@ -204,6 +212,8 @@ void main() {
     out_[(axis + 2) % 3] = corner >= 2 ? 1.0 : -1.0;
     seen += modelViewMatrix * vec4(out_ * (-seen.z * pixel), 0.0);
     gl_Position = projectionMatrix * seen;
+    // Over an image, unknown space would hide what the image shows there.
+    if (alone > 0.5 && (flags & 255) == 0) gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
 }`;
 
 const FRAGMENT = `
@@ -249,10 +259,11 @@ function Space(T, context) {
     this.controls = new T.OrbitControls(this.camera, canvas);
     Object.assign(this.controls, { enableDamping: true, dampingFactor: 0.12, maxDistance: 4 * reach, minDistance: 0.5, zoomToCursor: true });
     this.controls.addEventListener("change", () => this.draw());
+    this.controls.addEventListener("start", leave);
 
     this.palette = new T.DataTexture(new Uint8Array(4 * 256), 256, 1);
     this.uniforms = {
-        palette: { value: this.palette }, paper: { value: new T.Color() }, pixel: { value: 0 }, density: { value: 1 },
+        palette: { value: this.palette }, paper: { value: new T.Color() }, pixel: { value: 0 }, density: { value: 1 }, alone: { value: 0 },
     };
     const material = new T.RawShaderMaterial({
         glslVersion: T.GLSL3, vertexShader: VERTEX, fragmentShader: FRAGMENT, uniforms: this.uniforms,
@@ -339,7 +350,39 @@ function Space(T, context) {
         this.palette.needsUpdate = true;
         this.draw();
     };
+    /** Draws the voxels alone into the picture over each image, as its camera sees them. */
+    this.lay = () => {
+        const eye = new T.PerspectiveCamera();
+        const others = [this.ground, this.vehicle, this.frusta, this.marker];
+        const visible = others.map((other) => other.visible);
+        for (const other of others) other.visible = false;
+        this.renderer.setPixelRatio(1);
+        this.uniforms.alone.value = 1;
+        this.uniforms.pixel.value = 0;
+        this.uniforms.density.value = 1;
+        for (const { camera, overlay } of images) {
+            const context = overlay.getContext("2d");
+            context.clearRect(0, 0, overlay.width, overlay.height);
+            const rows = projection(camera, 0.5, 8 * reach);
+            if (!rows) continue;
+            // The eye stays at the origin: the matrix says where the camera stands.
+            eye.projectionMatrix.set(...rows);
+            eye.projectionMatrixInverse.copy(eye.projectionMatrix).invert();
+            this.renderer.setSize(overlay.width, overlay.height, false);
+            this.renderer.render(this.scene, eye);
+            context.drawImage(canvas, 0, 0);
+        }
+        this.uniforms.alone.value = 0;
+        others.forEach((other, k) => (other.visible = visible[k]));
+        this.size();
+    };
+    /** Fits the picture to the stage, and the view too if the reader has not left it. */
     this.resize = () => {
+        hideTip();
+        this.size();
+        if (state.view) go(state.view);
+    };
+    this.size = () => {
         const [width, height] = [stage.clientWidth, stage.clientHeight];
         if (!width || !height) return;
         const density = Math.min(2, window.devicePixelRatio || 1);
@@ -546,13 +589,8 @@ function show() {
 
 function layImages() {
     for (const { overlay } of images) overlay.hidden = !state.overlay;
+    if (space && state.overlay && images.length > 0) space.lay();
     canvas.dataset.laid = "true";
-    if (!state.overlay || images.length === 0) return;
-    const found = surface(shown, size, low, edge);
-    const list = new Uint32Array(colours().map(([r, g, b]) => (255 << 24 | b << 16 | g << 8 | r) >>> 0));
-    for (const { camera, overlay } of images) {
-        overlay.dataset.voxels = lay(overlay, camera, found, shown, list, Math.max(...edge));
-    }
 }
 
 // --- What a voxel is ----------------------------------------------------------------------------------------------------
@@ -571,7 +609,7 @@ function under(x, y) {
 /** What is known of a voxel: its name, and lines of text. */
 function facts([x, y, z]) {
     const index = (x * size[1] + y) * size[2] + z;
-    const named = (c) => (c === UNLABELLED && known <= UNLABELLED ? "no label" : data.classes[c].name);
+    const named = (c) => (c === UNLABELLED ? "no label" : data.classes[c].name);
     const { layer } = state;
     const group = layer.groups[index];
     const lines = [];
@@ -581,7 +619,7 @@ function facts([x, y, z]) {
     if (truth) lines.push(`${data.prediction.caption}: ${named(prediction[index])}`, `${data.truth.caption}: ${named(truth[index])}`);
     lines.push(`voxel ${x}, ${y}, ${z}`);
     lines.push([x, y, z].map((v, k) => `${"xyz"[k]} ${metres(low[k] + (v + 0.5) * edge[k])}`).join("  ") + " m");
-    if (support) lines.push(support[index] ? `seen by ${thousands(support[index])} feature ${support[index] === 1 ? "pixel" : "pixels"}` : "seen by no camera: a guess");
+    if (support) lines.push(support[index] ? `seen by ${thousands(support[index])} feature ${support[index] === 1 ? "pixel" : "pixels"}` : layer.key === "prediction" ? "seen by no camera: a guess" : "seen by no camera");
     return { name, rgb, lines };
 }
 
@@ -632,7 +670,7 @@ function fillFacts() {
         ["Occupied", `${thousands(filled)} (${percent(filled, prediction.length)})`],
         ["Digest", data.digest],
     ];
-    if (truth) list.splice(3, 0, ["Score", score()]);
+    if (truth) list.splice(3, 0, ["Score", score]);
     for (const [term, text] of list) $("facts").append(make("div", {}, make("dt", {}, term), make("dd", {}, text)));
     $("facts").title = `voxcast ${data.version}; the digest is the XXH3-64 of the classes`;
 }
@@ -658,7 +696,7 @@ function fillClasses() {
     const counts = layer.key === "difference" ? layer.counts : layers.slice(0, 2).reduce((sum, l) => sum.map((n, k) => n + l.counts[k]), new Uint32Array(256));
     $("classes-title").textContent = layer.key === "difference" ? "Difference" : "Classes";
     $("score").hidden = layer.key !== "difference";
-    if (truth) $("score").textContent = score();
+    if (truth) $("score").textContent = score;
     const total = layer.groups.length - layer.counts[0];
     const rows = layer.legend.filter(({ group }) => counts[group] > 0 || layer.key === "difference").map(({ group, name, rgb, note }) => {
         const input = make("input", { type: "checkbox", "data-group": group });
@@ -690,6 +728,7 @@ function switchAll(on) {
 /** Two thumbs on one track; they cannot pass each other. */
 function fillHeight() {
     const inputs = [$("low"), $("high")];
+    let frame = 0;
     const update = () => {
         const [a, b] = [state.low, state.high].map((v) => low[2] + v * edge[2]);
         $("height").textContent = `${metres(a)} to ${metres(b)} m`;
@@ -707,7 +746,14 @@ function fillHeight() {
             else state.low = Math.min(Number(input.value), state.high - 1);
             input.value = k ? state.high : state.low;
             update();
-            show();
+            // A slider that is dragged sends more steps than there are frames.
+            canvas.dataset.laid = "false";
+            if (!frame) {
+                frame = requestAnimationFrame(() => {
+                    frame = 0;
+                    show();
+                });
+            }
         });
     });
     update();
@@ -736,11 +782,12 @@ function fillCameras() {
             const { at, ahead: direction, reach: wide } = pose(camera);
             const aspect = stage.clientWidth / stage.clientHeight;
             const field = 2 * Math.atan(Math.max(wide[1], wide[0] / aspect)) * 180 / Math.PI;
+            leave();
             space.fly(at, at.map((v, k) => v + 8 * direction[k]), Math.min(120, field));
-            for (const other of images) other.button.removeAttribute("aria-current");
             button.setAttribute("aria-current", "true");
             canvas.focus({ preventScroll: true });
-            stage.scrollIntoView({ block: "nearest", behavior: "smooth" });
+            const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
+            stage.scrollIntoView({ block: "nearest", behavior: still ? "auto" : "smooth" });
         });
         images.push({ camera, overlay, button });
         const item = make("li", {}, button);
@@ -753,14 +800,23 @@ function fillCameras() {
     });
 }
 
+/** The reader looks from elsewhere than before: neither from a camera nor as the page began. */
+function leave() {
+    state.view = null;
+    for (const { button } of images) button.removeAttribute("aria-current");
+}
+
 function go(view) {
     if (!space) return;
-    for (const { button } of images) button.removeAttribute("aria-current");
+    leave();
+    state.view = view;
     space.fly(...VIEWS[view]());
 }
 
 /** Turns the camera around what it looks at, by radians, or goes nearer by a factor. */
 function turn(sideways, upwards, nearer) {
+    leave();
+    hideTip();
     const { camera, controls } = space;
     const offset = minus(camera.position.toArray(), controls.target.toArray());
     const distance = Math.hypot(...offset) * nearer;
@@ -812,6 +868,14 @@ function listen() {
         if (!space || !action || event.ctrlKey || event.metaKey || event.altKey) return;
         event.preventDefault();
         action();
+    });
+
+    // Phones take the context from pages that are not looked at.
+    canvas.addEventListener("webglcontextlost", () => tell("The browser took back the memory of this picture."));
+    canvas.addEventListener("webglcontextrestored", () => {
+        tell("");
+        paintGround();
+        show();
     });
 
     let pressed = null;
@@ -876,7 +940,6 @@ themed();
 if (space) {
     space.resize();
     new ResizeObserver(space.resize).observe(stage);
-    go("home");
 }
 show();
 document.body.dataset.ready = "true";

@@ -8,6 +8,7 @@ use image::RgbImage;
 use serde_json::{Value, json};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
+use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -46,17 +47,20 @@ impl Browser {
     /// # Panics
     /// If there is no `chromedriver`, or it starts no browser.
     pub fn start(screen: Screen) -> Self {
-        let driver = Command::new("chromedriver").arg("--port=0").stdout(Stdio::piped()).spawn();
+        let driver = Command::new("chromedriver").arg("--port=0").stdout(Stdio::piped()).process_group(0).spawn();
         let mut driver = driver.expect("chromedriver starts (tests/run --install)");
         let said = BufReader::new(driver.stdout.take().expect("a pipe"));
+        let mut browser = Self { driver, port: 0, session: String::new() };
         let port = said
             .lines()
             .map_while(Result::ok)
             .find_map(|line| line.split_once("started successfully on port ")?.1.trim_end_matches('.').parse().ok());
-        let mut browser = Self { driver, port: port.expect("chromedriver names its port"), session: String::new() };
+        browser.port = port.expect("chromedriver names its port");
         let [width, height] = screen.size;
         // The sandbox needs rights that a container may lack; the pages are our own.
         let mut arguments = vec!["--headless=new".to_owned(), "--no-sandbox".into(), "--hide-scrollbars".into()];
+        // Containers often give shared memory little room.
+        arguments.push("--disable-dev-shm-usage".into());
         arguments.push(format!("--window-size={width},{height}"));
         if screen.webgl {
             arguments.extend(["--use-angle=swiftshader".into(), "--enable-unsafe-swiftshader".into()]);
@@ -204,10 +208,9 @@ impl Browser {
 
 impl Drop for Browser {
     fn drop(&mut self) {
-        if !self.session.is_empty() && !std::thread::panicking() {
-            self.send("DELETE", &self.session, &Value::Null);
-        }
-        // Nobody is left to tell. A browser whose driver is gone ends by itself.
+        // The browser belongs to the driver's group, and outlives the driver alone. Nobody is left to tell of failures.
+        let group = format!("-{}", self.driver.id());
+        let _ = Command::new("kill").args(["-KILL", "--", &group]).status();
         let _ = self.driver.kill();
         let _ = self.driver.wait();
     }

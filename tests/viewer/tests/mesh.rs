@@ -25,7 +25,7 @@ const SETUP: &str = "
 
 fn browser() -> Browser {
     let browser = Browser::start(DESK);
-    let directory = tempfile::tempdir().unwrap();
+    let directory = tempfile::tempdir_in(env!("CARGO_TARGET_TMPDIR")).unwrap();
     let path = directory.path().join("empty.html");
     std::fs::write(&path, "<!doctype html><body data-ready='true'>").unwrap();
     browser.open(Path::new(&path));
