@@ -430,6 +430,7 @@ fn help_and_usage() {
         &["eval", "--data", "synthetic:d"],
         &["eval", "--model", "m", "--data", "occ3d:d"],
         &["eval", "--model", "m", "--data", "semantickitti:d:22"],
+        &["eval", "--compare", "a", "b", "--compare", "c", "d", "--data", "synthetic:d"],
         &["view"],
     ] {
         let output = voxcast(bad);
@@ -997,6 +998,9 @@ fn an_evaluation_that_was_stopped_goes_on() {
     fs::write(&frame, kept).unwrap();
     let line = refused("scores.jsonl", &["eval", "--model", &model, "--data", &data, "--resume", &journal]);
     assert!(line.contains("another evaluation"), "{line}");
+    let line = refused("scores.jsonl", &[&resumed[..8], &["--json", &journal]].concat());
+    assert!(line.contains("--resume and --json write the same file"), "{line}");
+    assert_eq!(fs::read_to_string(&journal).unwrap().lines().count(), 5);
     fs::write(place.path("notes"), "my notes\n").unwrap();
     refused("notes", &["eval", "--model", &model, "--data", &data, "--resume", &place.text("notes")]);
     assert_eq!(fs::read_to_string(place.path("notes")).unwrap(), "my notes\n");
@@ -1050,6 +1054,19 @@ fn a_drive_is_run_with_one_session() {
     assert!(refused("drive", &[&run[..], &["--png", &film]].concat()).contains("--png shows one scene"));
     let one = place.text("drive/000");
     refused("000", &["run", "--model", &model, &one, "-o", &place.text("o.npz"), "--animation", &film]);
+    let rig = place.text("rig of the drive");
+    done(&["rig", &one, "--model", &model, "-o", &rig]);
+    let with_rig = [&run[..], &["--rig", &rig, "--json"]].concat();
+    let again: Value = serde_json::from_str(&done(&with_rig)).unwrap();
+    assert_eq!((&again["digest"], &again["rigs"]), (&summary["digest"], &json!(1)));
+    // A camera that moves gets matrices of its own, unless a rig is given.
+    let calibration = place.path("drive/002/calibration.json");
+    let mut moved: Value = serde_json::from_slice(&fs::read(&calibration).unwrap()).unwrap();
+    moved["cameras"][0]["lidar2img"][0][3] = json!(1.5);
+    fs::write(&calibration, moved.to_string()).unwrap();
+    let again: Value = serde_json::from_str(&done(&[&run[..], &["--json"]].concat())).unwrap();
+    assert_eq!(again["rigs"], 2);
+    assert!(refused("drive/002", &with_rig).contains("another calibration"));
     fs::write(place.path("drive/001/calibration.json"), "{}").unwrap();
     refused("drive/001/calibration.json", &[&run[..], &["--animation", &film]].concat());
     assert!(fs::read(&film).unwrap() == bytes, "the old animation stays");

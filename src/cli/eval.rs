@@ -35,7 +35,7 @@ pub struct Eval {
     #[arg(long, required_unless_present_any = ["majority", "compare"], conflicts_with_all = ["majority", "compare"])]
     model: Option<PathBuf>,
     /// Score two models, and compare what they say class by class
-    #[arg(long, value_names = ["A", "B"], num_args = 2, conflicts_with = "majority")]
+    #[arg(long, value_names = ["A", "B"], num_args = 2, action = clap::ArgAction::Set, conflicts_with = "majority")]
     compare: Vec<PathBuf>,
     /// Instead of a model, predict in each voxel the class that is most frequent there in another set
     #[arg(long, value_name = "SET")]
@@ -74,6 +74,7 @@ impl Eval {
         for path in [&self.json, &self.markdown, &self.confusion, &self.resume].into_iter().flatten() {
             frame::check_output(path)?;
         }
+        self.check_apart()?;
         let set = self.data.open()?;
         let options = Options::default();
         let predictors = self.predictors(&*set, &options)?;
@@ -92,6 +93,26 @@ impl Eval {
         };
         let totals = scoring::score(&*set, &predictors, &means, totals, journal, count)?.finish();
         self.report(&*set, &predictors, &options, &totals, count)
+    }
+
+    /// Refuses two outputs in one file, of which the last would be left: a report in the place of hours of scores.
+    fn check_apart(&self) -> Result<()> {
+        let mut taken: Vec<(&str, PathBuf)> = Vec::new();
+        for (flag, path) in [
+            ("--resume", &self.resume),
+            ("--json", &self.json),
+            ("--markdown", &self.markdown),
+            ("--confusion", &self.confusion),
+        ] {
+            let Some(path) = path else { continue };
+            let place = std::path::absolute(path).map_err(|e| Error::io(path, "find", &e))?;
+            let place = std::fs::canonicalize(&place).unwrap_or(place);
+            if let Some((other, _)) = taken.iter().find(|(_, other)| *other == place) {
+                return Err(Error::mismatch(format!("{other} and {flag} write the same file")).in_file(path));
+            }
+            taken.push((flag, place));
+        }
+        Ok(())
     }
 
     fn predictors(&self, set: &dyn DataSet, options: &Options) -> Result<Vec<Predictor>> {
@@ -135,8 +156,12 @@ impl Eval {
         let what = json!({
             "data": self.data.to_string(),
             "predictors": predictors.iter().map(|predictor| predictor.says.identity()).collect::<Vec<_>>(),
+            "grid": { "size": set.grid().size, "bounds": set.grid().bounds },
+            "classes": set.classes(),
+            "masks": set.masks(),
             "losses": self.losses,
             "rings": options.rings,
+            "version": env!("CARGO_PKG_VERSION"),
         });
         let index_of: HashMap<&str, usize> = (0..count).map(|index| (set.id(index), index)).collect();
         Journal::open(path, &what, predictors[0].scorer.kind(), predictors.len(), &mut |frame, score| {

@@ -19,6 +19,7 @@ use voxcast::{Error, Network, Result, Scene};
 /// Run a model on a scene and write the class of every voxel.
 ///
 /// A directory of scenes, such as a drive that `voxcast synth --frames` draws, is run with one session, in the order of names.
+/// Latencies are those of all scenes but the first, which stands apart: it also waits for the model's pages.
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Examples:

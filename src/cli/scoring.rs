@@ -82,6 +82,9 @@ pub fn score(
         while let Some(&index) = left.get(next.fetch_add(1, Ordering::Relaxed)) {
             let score = worker.score(set, index)?;
             let mut shared = lock(&shared);
+            if shared.failed.is_some() {
+                return Ok(());
+            }
             if let Some(journal) = &mut shared.journal {
                 journal.append(set.id(index), &score)?;
             }

@@ -2,7 +2,7 @@
 
 use super::run::{Run, digest, draw, masked, title, write};
 use super::{frame, terminal};
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -29,6 +29,22 @@ pub fn scenes(path: &Path) -> Result<Option<Vec<PathBuf>>> {
     Ok((!scenes.is_empty()).then_some(scenes))
 }
 
+/// What the results of scenes are called: a directory's name, or a file's without its ending.
+fn names(scenes: &[PathBuf]) -> Result<Vec<String>> {
+    let mut names = Vec::with_capacity(scenes.len());
+    let mut taken = HashMap::new();
+    for path in scenes {
+        let name = if path.is_dir() { path.file_name() } else { path.file_stem() };
+        let name = name.unwrap_or_default().to_string_lossy().into_owned();
+        if let Some(other) = taken.insert(name.clone(), path) {
+            let message = format!("its result would be called {name}.npz, as that of {}", other.display());
+            return Err(Error::mismatch(message).in_file(path));
+        }
+        names.push(name);
+    }
+    Ok(names)
+}
+
 /// What is known about a scene that was run.
 struct Done {
     name: String,
@@ -50,6 +66,7 @@ impl Run {
         if let Some(path) = &self.animation {
             frame::check_output(path)?;
         }
+        let names = names(scenes)?;
         std::fs::create_dir_all(&self.output).map_err(|e| Error::io(&self.output, "create", &e))?;
         let model = Arc::new(Model::open(&self.model)?);
         let mut options = frame::options(&self.machine)?;
@@ -60,7 +77,7 @@ impl Run {
         let mut animation: Option<Animation> = None;
         let mut done: Vec<Done> = Vec::with_capacity(scenes.len());
         let bar = terminal::progress("running", scenes.len());
-        for path in scenes {
+        for (path, name) in scenes.iter().zip(names) {
             let start = Instant::now();
             let scene = Scene::open(path)?;
             scene.check(model.network()).map_err(|e| e.in_file(path))?;
@@ -73,7 +90,6 @@ impl Run {
             let start = Instant::now();
             let result = driver.session.run_scene(&scene).map_err(|e| e.in_file(path))?;
             let frame = start.elapsed();
-            let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
             write(&self.output.join(format!("{name}.npz")), model.network(), &result, self.logits)?;
             if let Some(path) = &self.animation {
                 let subtitle = format!("{name}, {} of {}", done.len() + 1, scenes.len());
@@ -83,10 +99,10 @@ impl Run {
                     Some(animation) => animation,
                     none => {
                         let size = [page.width, page.height];
-                        none.insert(Animation::create(path, size, scenes.len(), 1000 / self.rate)?)
+                        none.insert(Animation::create(path, size, scenes.len(), self.rate)?)
                     }
                 };
-                animation.push(&page)?;
+                animation.push(&page.fitted(animation.size()))?;
             }
             done.push(Done { name, digest: digest(&result), read, frame });
             bar.inc(1);
@@ -169,7 +185,11 @@ impl Driver {
             let (found, expected) = (scene.cameras(), self.calibration.len());
             return Err(Error::mismatch(format!("{found} cameras, expected {expected} as in the scenes before")));
         }
-        if self.calibration != scene.lidar2img && !self.fixed {
+        if self.calibration != scene.lidar2img && self.fixed {
+            let message = "another calibration than the first scene, and --rig is of one; leave --rig out";
+            return Err(Error::mismatch(message));
+        }
+        if self.calibration != scene.lidar2img {
             let start = Instant::now();
             let rig: Rig = self.builder.build(&scene.lidar2img)?;
             self.session.set_rig(Arc::new(rig))?;
@@ -229,6 +249,16 @@ impl std::fmt::Display for Latency {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn names_are_told_apart() {
+        let dir = tempfile::tempdir().unwrap();
+        let paths = ["153.612", "153.664", "a.safetensors"].map(|name| dir.path().join(name));
+        paths[..2].iter().for_each(|path| std::fs::create_dir(path).unwrap());
+        assert_eq!(names(&paths).unwrap(), ["153.612", "153.664", "a"]);
+        let twice = [dir.path().join("153.612"), dir.path().join("153.612.safetensors")];
+        assert!(names(&twice).unwrap_err().message().contains("called 153.612.npz"));
+    }
 
     #[test]
     fn ranks_of_latencies_by_hand() {

@@ -24,7 +24,7 @@ impl Pose {
         let length = quaternion.length();
         if !length.is_normal() {
             return Err(Error::format(format!(
-                "rotation [{w}, {x}, {y}, {z}], expected a quaternion of length about 1"
+                "rotation [{w}, {x}, {y}, {z}], expected a quaternion that is finite and not zero"
             )));
         }
         if !shift.iter().all(|v| v.is_finite()) {

@@ -62,8 +62,8 @@ fn class_of(label: u16) -> Option<u8> {
         72 => 17,
         80 => 18,
         81 => 19,
-        // Outlier, other structure, error, other object.
-        1 | 52 | 53 | 99 => IGNORED,
+        // Outlier, other structure, other object.
+        1 | 52 | 99 => IGNORED,
         _ => return None,
     })
 }

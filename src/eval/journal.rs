@@ -9,18 +9,23 @@ use super::{Confusion, FrameScore, Kind, LossSum, Score};
 use crate::error::{Error, ErrorKind, Result};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-use std::fs::{File, OpenOptions};
-use std::io::{BufRead, BufReader, Read, Seek, SeekFrom, Write};
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 
-/// Longest line in bytes: 255 rings of five regions of 255 classes would need a twentieth of it.
-const MAX_LINE: u64 = 1 << 30;
+/// Longest line in bytes: a frame of twenty classes in twenty rings and regions needs a hundredth of it.
+const MAX_LINE: u64 = 64 << 20;
+
+/// Voxels or rays that a frame may count.
+const MAX_COUNT: u64 = 1 << 40;
 
 /// An open journal. No other process can open it meanwhile.
 #[derive(Debug)]
 pub struct Journal {
     file: File,
     path: PathBuf,
+    /// Bytes of the lines that are whole.
+    length: u64,
 }
 
 /// A frame as it is written. Counts are sparse: places and numbers, one after the other.
@@ -48,7 +53,7 @@ impl Journal {
     ///
     /// # Errors
     /// [`ErrorKind::Mismatch`] if the file is of another evaluation; [`ErrorKind::Format`] for a file that is no journal or
-    /// has a malformed line before its last; [`ErrorKind::Io`] if it cannot be read and written, or is open elsewhere.
+    /// has a malformed line; [`ErrorKind::Io`] if it cannot be read, written and locked, or is open elsewhere.
     pub fn open(
         path: &Path,
         what: &Value,
@@ -59,8 +64,12 @@ impl Journal {
         let io = |doing: &'static str| move |e: std::io::Error| Error::io(path, doing, &e);
         let mut file = OpenOptions::new();
         let file = file.read(true).append(true).create(true).open(path).map_err(io("open"))?;
-        if file.try_lock().is_err() {
-            return Err(Error::new(ErrorKind::Io, "another evaluation has it open").in_file(path));
+        match file.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => {
+                return Err(Error::new(ErrorKind::Io, "another evaluation has it open").in_file(path));
+            }
+            Err(TryLockError::Error(e)) => return Err(Error::io(path, "lock", &e)),
         }
         let header = json!({ "voxcast": "evaluation", "version": 1, "what": what });
         let mut reader = BufReader::new(&file);
@@ -69,22 +78,30 @@ impl Journal {
         for number in 1u64.. {
             text.clear();
             let length = (&mut reader).take(MAX_LINE).read_until(b'\n', &mut text).map_err(io("read"))?;
-            let Some(line) = text.strip_suffix(b"\n") else { break };
             let wrong = |message: String| Error::format(format!("line {number}: {message}")).in_file(path);
+            let Some(line) = text.strip_suffix(b"\n") else {
+                if length as u64 == MAX_LINE {
+                    return Err(wrong(format!("longer than {MAX_LINE} bytes")));
+                }
+                break;
+            };
             if number == 1 {
                 let first: Value = serde_json::from_slice(line).map_err(|e| wrong(e.to_string()))?;
                 if first != header {
-                    let message = format!("it is of another evaluation: {}, expected {what}", first["what"]);
+                    let message = format!("it is of another evaluation: {first}, expected {header}");
                     return Err(Error::mismatch(message).in_file(path));
                 }
             } else {
                 let line: Line = serde_json::from_slice(line).map_err(|e| wrong(e.to_string()))?;
                 let score = line.score(kind, predictors);
-                found(&line.frame, score.ok_or_else(|| wrong("counts of other classes or regions".to_owned()))?);
+                found(
+                    &line.frame,
+                    score.ok_or_else(|| wrong("counts that no frame of this evaluation has".to_owned()))?,
+                );
             }
             whole += length as u64;
         }
-        let mut journal = Self { file, path: path.to_owned() };
+        let mut journal = Self { file, path: path.to_owned(), length: whole };
         if whole == 0 {
             // Nothing of ours: only an empty file may become a journal.
             if !text.is_empty() && !format!("{header}\n").as_bytes().starts_with(&text) {
@@ -94,15 +111,14 @@ impl Journal {
             journal.write(&header)?;
         } else {
             journal.file.set_len(whole).map_err(io("write"))?;
-            journal.file.seek(SeekFrom::End(0)).map_err(io("write"))?;
         }
         Ok(journal)
     }
 
-    /// Appends a frame.
+    /// Appends a frame, and waits until the disk has it.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] if it cannot be written.
+    /// [`ErrorKind::Io`] if it cannot be written; then nothing of it stays in the file.
     pub fn append(&mut self, frame: &str, score: &FrameScore) -> Result<()> {
         self.write(&Line::of(frame, score))
     }
@@ -110,7 +126,14 @@ impl Journal {
     fn write(&mut self, line: &impl Serialize) -> Result<()> {
         let mut bytes = serde_json::to_vec(line).map_err(|e| Error::format(e.to_string()).in_file(&self.path))?;
         bytes.push(b'\n');
-        self.file.write_all(&bytes).map_err(|e| Error::io(&self.path, "write", &e))
+        let written = self.file.write_all(&bytes).and_then(|()| self.file.sync_data());
+        if let Err(e) = written {
+            // Half a line would make one of it and the next. If this fails too, the next opening refuses the file.
+            let _ = self.file.set_len(self.length);
+            return Err(Error::io(&self.path, "write", &e));
+        }
+        self.length += bytes.len() as u64;
+        Ok(())
     }
 }
 
@@ -151,8 +174,15 @@ impl LineScore {
             (rings.len() == kind.rings).then(|| rings.iter().map(|counts| dense(kind.classes, counts)).collect())?
         };
         let regions = self.regions.iter().map(rings).collect::<Option<Vec<_>>>()?;
-        let right = regions.len() == kind.regions && self.rays.iter().all(|counts| counts.len() == kind.classes);
+        let fits = |counts: &Vec<u64>| counts.len() == kind.classes && counts.iter().all(|&n| n <= MAX_COUNT);
         let [labelled, predicted, one, two, four] = self.rays.clone();
+        let possible = |hits: &Vec<u64>| {
+            let most = labelled.iter().zip(&predicted).map(|(l, p)| l.min(p));
+            hits.iter().zip(most).all(|(hits, most)| hits <= most)
+        };
+        let right = regions.len() == kind.regions
+            && self.rays.iter().all(fits)
+            && [&one, &two, &four].into_iter().all(possible);
         let [frames, losses @ ..] = self.losses;
         let [focal, lovasz, geometric, semantic] = losses.map(f64::from_bits);
         right.then_some(Score {
@@ -169,12 +199,12 @@ fn sparse(confusion: &Confusion) -> Vec<u64> {
     counts.flat_map(|(place, &count)| [place, count]).collect()
 }
 
-/// The counts again; none if a place is beyond the matrix.
+/// The counts again; none if a place is beyond the matrix or a number beyond what frames have.
 fn dense(classes: usize, pairs: &[u64]) -> Option<Confusion> {
     let mut counts = vec![0; classes * classes];
     for pair in pairs.chunks(2) {
         let &[place, count] = pair else { return None };
-        *counts.get_mut(usize::try_from(place).ok()?)? = count;
+        *counts.get_mut(usize::try_from(place).ok()?)? = Some(count).filter(|&count| count <= MAX_COUNT)?;
     }
     Confusion::from_counts(classes, counts)
 }
@@ -190,6 +220,7 @@ mod tests {
         let mut scores = vec![Score::new(KIND); predictors];
         for score in &mut scores {
             score.regions[1][0].add(seed % 3, 2);
+            (score.rays.labelled[1], score.rays.predicted[1]) = (9, 12);
             score.rays.hits[2][1] = u64::from(seed);
             let value = f64::from(seed) / 3.0;
             score.losses.add(&Losses { focal: value, lovasz: value.exp(), geometric: 1e-300, semantic: -0.0 });
@@ -250,14 +281,16 @@ mod tests {
         assert!(error.message().contains("another evaluation has it open"), "{error}");
         drop(journal);
         let good = fs::read(&path).unwrap();
-        refused(&good, "y", 1, "another evaluation: \"x\", expected \"y\"");
-        refused(&good, "x", 2, "line 2: counts of other classes or regions");
+        refused(&good, "y", 1, "\"what\":\"x\"");
+        refused(&good, "x", 2, "line 2: counts that no frame");
         refused(b"my notes", "x", 1, "not a journal");
         refused(b"my notes\n", "x", 1, "line 1");
         let text = String::from_utf8(good).unwrap();
         refused(text.replace("\"regions\":[", "\"regions\":[[],").as_bytes(), "x", 1, "line 2: counts");
         refused(text.replace("[5,1]", "[9,1]").as_bytes(), "x", 1, "line 2: counts");
         refused(text.replace("[5,1]", "[5]").as_bytes(), "x", 1, "line 2: counts");
+        refused(text.replace("[5,1]", "[5,1099511627777]").as_bytes(), "x", 1, "line 2: counts");
+        refused(text.replace("[0,9,0]", "[0,0,0]").as_bytes(), "x", 1, "line 2: counts");
         refused(text.replace("\"losses\"", "\"loses\"").as_bytes(), "x", 1, "line 2: ");
     }
 }

@@ -24,14 +24,14 @@ pub struct Animation {
 }
 
 impl Animation {
-    /// Begins an animation of `frames` pictures of `width` x `height` pixels, each shown for `milliseconds`, over and over.
+    /// Begins an animation of `frames` pictures of `width` x `height` pixels, `rate` of them per second, over and over.
     ///
     /// # Errors
     /// [`ErrorKind::Io`] if the file cannot be made; [`ErrorKind::Format`] without pictures or pixels;
     /// [`ErrorKind::TooLarge`] beyond what the format can count.
-    pub fn create(path: &Path, [width, height]: [usize; 2], frames: usize, milliseconds: u16) -> Result<Self> {
-        if frames == 0 || width == 0 || height == 0 {
-            return Err(Error::format("an animation without pictures or pixels").in_file(path));
+    pub fn create(path: &Path, [width, height]: [usize; 2], frames: usize, rate: u16) -> Result<Self> {
+        if frames == 0 || width == 0 || height == 0 || rate == 0 {
+            return Err(Error::format("an animation without pictures, pixels or rate").in_file(path));
         }
         let counted = |n: usize| {
             u32::try_from(n).map_err(|_| Error::new(ErrorKind::TooLarge, format!("an animation of {n}")).in_file(path))
@@ -46,10 +46,15 @@ impl Animation {
         encoder.set_filter(Filter::Adaptive);
         if frames > 1 {
             encoder.set_animated(counted(frames)?, 0).map_err(failed)?;
-            encoder.set_frame_delay(milliseconds, 1000).map_err(failed)?;
+            encoder.set_frame_delay(1, rate).map_err(failed)?;
         }
         let writer = encoder.write_header().map_err(failed)?;
         Ok(Self { path: path.to_owned(), replacement, writer, width, height, left: frames })
+    }
+
+    /// Width and height of its pictures.
+    pub fn size(&self) -> [usize; 2] {
+        [self.width, self.height]
     }
 
     /// Appends a picture.
@@ -78,7 +83,7 @@ impl Animation {
         if left > 0 {
             return Err(Error::mismatch(format!("{left} pictures of the animation are missing")).in_file(&path));
         }
-        // Drops, and so flushes, what is buffered.
+        // This flushes what is buffered.
         writer.finish().map_err(|e| Error::io(&path, "write", &std::io::Error::other(e)))?;
         replacement.commit(&path)
     }
@@ -105,6 +110,21 @@ impl Picture {
     }
 }
 
+impl Picture {
+    /// The same in a page of another size: cut, or white at the right and at the bottom.
+    #[must_use]
+    pub fn fitted(self, [width, height]: [usize; 2]) -> Picture {
+        if [self.width, self.height] == [width, height] {
+            return self;
+        }
+        let mut rgb = vec![255; width * height * 3];
+        let kept = 3 * width.min(self.width);
+        let rows = rgb.chunks_exact_mut(3 * width.max(1)).zip(self.rgb.chunks_exact(3 * self.width.max(1)));
+        rows.for_each(|(to, from)| to[..kept].copy_from_slice(&from[..kept]));
+        Picture { width, height, rgb }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -121,7 +141,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         for count in [1, 2, 5] {
             let path = dir.path().join(format!("{count}.png"));
-            let mut animation = Animation::create(&path, [7, 5], count, 250).unwrap();
+            let mut animation = Animation::create(&path, [7, 5], count, 4).unwrap();
             let pictures: Vec<_> = (0..count).map(|i| picture(40 * i as u8)).collect();
             pictures.iter().for_each(|picture| animation.push(picture).unwrap());
             assert!(!path.exists());
@@ -137,7 +157,7 @@ mod tests {
             let frames = decoder.apng().unwrap().into_frames().collect_frames().unwrap();
             assert_eq!(frames.len(), count);
             for (frame, picture) in frames.iter().zip(&pictures) {
-                assert_eq!(frame.delay().numer_denom_ms(), (250, 1));
+                assert_eq!(std::time::Duration::from(frame.delay()).as_millis(), 250);
                 let rgb: Vec<u8> = frame.buffer().pixels().flat_map(|p| [p[0], p[1], p[2]]).collect();
                 assert_eq!(rgb, picture.rgb);
             }
@@ -148,12 +168,22 @@ mod tests {
     fn unfinished_and_unfitting_ones_leave_no_file() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.png");
-        let mut animation = Animation::create(&path, [7, 5], 2, 250).unwrap();
+        let mut animation = Animation::create(&path, [7, 5], 2, 4).unwrap();
         assert!(animation.push(&picture(0).scaled(6)).unwrap_err().message().contains("6 x 5"));
         animation.push(&picture(0)).unwrap();
         assert!(animation.finish().unwrap_err().message().contains("1 pictures"));
-        assert!(Animation::create(&path, [7, 5], 0, 250).is_err());
+        assert!(Animation::create(&path, [7, 5], 0, 4).is_err());
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 0);
+    }
+
+    #[test]
+    fn fitting_cuts_or_leaves_white() {
+        let wide = picture(0).fitted([9, 4]);
+        assert_eq!((wide.width, wide.height, wide.rgb.len()), (9, 4, 108));
+        assert_eq!((&wide.rgb[..21], &wide.rgb[21..27]), (&picture(0).rgb[..21], &[255; 6][..]));
+        let high = picture(0).fitted([2, 6]);
+        assert_eq!((&high.rgb[24..30], &high.rgb[30..]), (&picture(0).rgb[84..90], &[255; 6][..]));
+        assert_eq!(picture(3).fitted([7, 5]), picture(3));
     }
 
     #[test]
