@@ -1,13 +1,13 @@
 //! How `eval` computes: frames of a data set, several at a time, each with all its predictors.
 
+use super::frame::Moving;
 use super::terminal;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 use voxcast::dataset::{DataSet, Frame, Grid};
 use voxcast::eval::{Confusion, FrameScore, Journal, Prediction, Scorer, Totals};
-use voxcast::rig::RigBuilder;
-use voxcast::{Error, Isa, Model, Occupancy, Result, Rig, Session, SessionOptions, Threads};
+use voxcast::{Error, Isa, Model, Occupancy, Result, SessionOptions, Threads};
 
 /// Who predicts, and how that is scored.
 pub struct Predictor {
@@ -117,14 +117,7 @@ struct Worker<'a> {
     predictors: &'a [Predictor],
     options: SessionOptions,
     /// For each predictor that is a model, the means to run it, made for its first frame.
-    running: Vec<Option<Running>>,
-}
-
-/// A session and what moves its cameras.
-struct Running {
-    session: Session,
-    builder: RigBuilder,
-    calibration: Vec<[f32; 16]>,
+    running: Vec<Option<Moving>>,
 }
 
 impl Worker<'_> {
@@ -136,7 +129,10 @@ impl Worker<'_> {
             let Frame { scene, truth } = set.frame(index)?;
             (Some(scene), truth)
         };
-        let said = |e: Error| Error::new(e.kind(), format!("frame {}: {}", set.id(index), e.message()));
+        let said = |e: Error| match e.path() {
+            Some(_) => e,
+            None => Error::new(e.kind(), format!("frame {}: {}", set.id(index), e.message())),
+        };
         let mut scores = Vec::with_capacity(self.predictors.len());
         let mut on_truth: Vec<Vec<u8>> = Vec::new();
         for (Predictor { says, scorer, .. }, running) in self.predictors.iter().zip(&mut self.running) {
@@ -145,9 +141,9 @@ impl Worker<'_> {
                     scene.check(model.network()).map_err(said)?;
                     let running = match running {
                         Some(running) => running,
-                        none => none.insert(Running::new(model, &scene.lidar2img, &self.options).map_err(said)?),
+                        none => none.insert(Moving::new(model, None, scene, &self.options).map_err(said)?),
                     };
-                    running.calibrate(&scene.lidar2img).map_err(said)?;
+                    running.calibrate(scene).map_err(said)?;
                     let Occupancy { classes, support, logits, .. } = running.session.run_scene(scene).map_err(said)?;
                     Prediction { classes, support: Some(support), logits }
                 }
@@ -169,25 +165,5 @@ impl Worker<'_> {
             _ => None,
         };
         Ok(FrameScore { scores, agreement })
-    }
-}
-
-impl Running {
-    fn new(model: &Arc<Model>, calibration: &[[f32; 16]], options: &SessionOptions) -> Result<Self> {
-        let builder = RigBuilder::new(model.network(), calibration.len(), options.isa)?;
-        let mut builder = builder.with_threads(options.threads.clone());
-        let rig = Arc::new(builder.build(calibration)?);
-        let session = Session::new(model.clone(), rig, options)?;
-        Ok(Self { session, builder, calibration: calibration.to_vec() })
-    }
-
-    /// Builds the matrices anew where the cameras have moved.
-    fn calibrate(&mut self, calibration: &[[f32; 16]]) -> Result<()> {
-        if self.calibration != calibration {
-            let rig: Rig = self.builder.build(calibration)?;
-            self.session.set_rig(Arc::new(rig))?;
-            self.calibration = calibration.to_vec();
-        }
-        Ok(())
     }
 }

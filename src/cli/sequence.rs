@@ -1,14 +1,14 @@
 //! `voxcast run` over the scenes of a drive, with one session.
 
+use super::frame::{self, Moving};
 use super::run::{Run, digest, draw, masked, title, write};
-use super::{frame, terminal};
+use super::terminal;
 use std::collections::{BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use voxcast::picture::Animation;
-use voxcast::rig::RigBuilder;
-use voxcast::{Error, Model, Result, Rig, Scene, Session, SessionOptions};
+use voxcast::{Error, Model, Result, Scene, SessionOptions};
 
 /// The scenes in `path`, in the order of their names, if it is a directory of scenes rather than a scene: directories
 /// with a calibration.json, and .safetensors files.
@@ -88,7 +88,7 @@ impl Run {
             };
             driver.prepare(self, &scene).map_err(|e| e.in_file(path))?;
             let start = Instant::now();
-            let result = driver.session.run_scene(&scene).map_err(|e| e.in_file(path))?;
+            let result = driver.moving.session.run_scene(&scene).map_err(|e| e.in_file(path))?;
             let frame = start.elapsed();
             write(&self.output.join(format!("{name}.npz")), model.network(), &result, self.logits)?;
             if let Some(path) = &self.animation {
@@ -111,7 +111,7 @@ impl Run {
         if let Some(animation) = animation {
             animation.finish()?;
         }
-        let rigs = driver.map_or((0, Duration::ZERO), |driver| (driver.rigs, driver.rig_time));
+        let rigs = driver.map_or((0, Duration::ZERO), |driver| (driver.moving.rigs, driver.moving.rig_time));
         self.print_sequence(&done, rigs);
         Ok(())
     }
@@ -151,55 +151,26 @@ impl Run {
 
 /// One session for all scenes.
 struct Driver {
-    session: Session,
-    builder: RigBuilder,
-    calibration: Vec<[f32; 16]>,
-    fixed: bool,
+    moving: Moving,
     masked: BTreeSet<usize>,
-    /// How many rigs were built or mapped, and how long that took.
-    rigs: usize,
-    rig_time: Duration,
 }
 
 impl Driver {
     fn new(run: &Run, model: &Arc<Model>, scene: &Scene, options: &SessionOptions) -> Result<Self> {
-        let start = Instant::now();
-        let rig = Arc::new(frame::rig(run.rig.as_deref(), model, scene, options)?);
-        let rig_time = start.elapsed();
-        let builder = RigBuilder::new(model.network(), scene.cameras(), options.isa)?;
-        Ok(Self {
-            session: frame::session(model, rig, options)?,
-            builder: builder.with_threads(options.threads.clone()),
-            calibration: scene.lidar2img.clone(),
-            fixed: run.rig.is_some(),
-            masked: BTreeSet::new(),
-            rigs: 1,
-            rig_time,
-        })
+        Ok(Self { moving: Moving::new(model, run.rig.as_deref(), scene, options)?, masked: BTreeSet::new() })
     }
 
     /// Makes the session ready for a scene: builds the matrices anew where its cameras have moved, and masks those that
     /// the user names.
     fn prepare(&mut self, run: &Run, scene: &Scene) -> Result<()> {
-        if self.calibration.len() != scene.cameras() {
-            let (found, expected) = (scene.cameras(), self.calibration.len());
-            return Err(Error::mismatch(format!("{found} cameras, expected {expected} as in the scenes before")));
-        }
-        if self.calibration != scene.lidar2img && self.fixed {
+        if run.rig.is_some() && !self.moving.fits(scene) {
             let message = "another calibration than the first scene, and --rig is of one; leave --rig out";
             return Err(Error::mismatch(message));
         }
-        if self.calibration != scene.lidar2img {
-            let start = Instant::now();
-            let rig: Rig = self.builder.build(&scene.lidar2img)?;
-            self.session.set_rig(Arc::new(rig))?;
-            self.calibration.clone_from(&scene.lidar2img);
-            self.rigs += 1;
-            self.rig_time += start.elapsed();
-        }
+        self.moving.calibrate(scene)?;
         let masked = masked(&run.mask, scene)?;
         for camera in self.masked.symmetric_difference(&masked) {
-            self.session.set_masked(*camera, masked.contains(camera))?;
+            self.moving.session.set_masked(*camera, masked.contains(camera))?;
         }
         self.masked = masked;
         Ok(())
