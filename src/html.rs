@@ -2,7 +2,7 @@
 //!
 //! The page opens from a disk, without a network: it holds the grids, the images and its own program, and its content
 //! security policy lets nothing be loaded and no form be sent. `src/html/` is that program: `viewer.html` with `viewer.css`; `mesh.js`, which
-//! makes triangles of voxels; `cameras.js`, which lays voxels over images; `viewer.js`, which answers the reader. three.js
+//! makes triangles of voxels; `cameras.js`, which reads cameras' matrices; `viewer.js`, which answers the reader. three.js
 //! (`assets/viewer/`) draws.
 //!
 //! Grids travel as base64 of zlib streams, images as JPEG. Everything that comes from a file, names above all, travels as

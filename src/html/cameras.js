@@ -1,4 +1,4 @@
-// Cameras: where they stand, and voxels laid over their images.
+// Cameras: where they stand, and how they see.
 //
 // A camera's matrix takes metres (x, y, z, 1) to (u d, v d, d, 1), with u and v in pixels of the original image and d the
 // depth. Its rows are combinations of the camera's axes, from which these are found again.

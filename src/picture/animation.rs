@@ -27,7 +27,7 @@ impl Animation {
     /// Begins an animation of `frames` pictures of `width` x `height` pixels, `rate` of them per second, over and over.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] if the file cannot be made; [`ErrorKind::Format`] without pictures or pixels;
+    /// [`ErrorKind::Io`] if the file cannot be made; [`ErrorKind::Format`] without pictures, pixels or rate;
     /// [`ErrorKind::TooLarge`] beyond what the format can count.
     pub fn create(path: &Path, [width, height]: [usize; 2], frames: usize, rate: u16) -> Result<Self> {
         if frames == 0 || width == 0 || height == 0 || rate == 0 {
