@@ -99,7 +99,7 @@ impl Object {
 impl Part {
     fn hit(&self, origin: Vec3, ray: Vec3, inverse: Vec3) -> Option<Hit> {
         let origin = origin - self.centre;
-        let (near, far) = slab(-self.half, self.half, origin, inverse)?;
+        let (near, _) = slab(-self.half, self.half, origin, inverse)?;
         match self.shape {
             Shape::Box => {
                 if near <= 0.0 {
@@ -111,30 +111,34 @@ impl Part {
                 normal[axis] = if ray[axis] > 0.0 { -1.0 } else { 1.0 };
                 Some(Hit { distance: near, normal })
             }
-            Shape::Ellipsoid => {
-                let (distance, at) = round(origin / self.half, ray / self.half)?;
-                (distance > 0.0).then(|| Hit { distance, normal: (at / self.half).normalize_or(Vec3::Z) })
-            }
-            Shape::Cylinder(axis) => self.hit_cylinder(axis, origin, ray, [near, far]),
+            Shape::Ellipsoid => self.hit_round(origin, ray, near, None),
+            Shape::Cylinder(axis) => self.hit_round(origin, ray, near, Some(axis)),
         }
     }
 
-    fn hit_cylinder(&self, axis: usize, origin: Vec3, ray: Vec3, [near, far]: [f32; 2]) -> Option<Hit> {
-        let (mut from, mut along) = (origin / self.half, ray / self.half);
-        let (start, step) = (from[axis], along[axis]);
-        (from[axis], along[axis]) = (0.0, 0.0);
-        let mantle = round(from, along).filter(|&(distance, _)| distance > 0.0);
-        if let Some((distance, at)) = mantle.filter(|(d, _)| (start + step * d).abs() <= 1.0) {
-            return Some(Hit { distance, normal: (at / self.half).normalize_or(Vec3::Z) });
+    /// Meets an ellipsoid, or a cylinder along `axis`. The ray enters the box at `near`: the equation is solved from there,
+    /// since from afar a thin pole's would be lost in rounding.
+    fn hit_round(&self, origin: Vec3, ray: Vec3, near: f32, axis: Option<usize>) -> Option<Hit> {
+        let (mut from, mut along) = ((origin + ray * near) / self.half, ray / self.half);
+        let (mut start, mut step) = (0.0, 0.0);
+        if let Some(axis) = axis {
+            (start, step) = (from[axis], along[axis]);
+            (from[axis], along[axis]) = (0.0, 0.0);
         }
-        // Through one of the ends, if the box is entered there and within the circle. A ray that enters the box beside the
-        // mantle and meets an end later passes: of a wheel that is a sliver at its rim.
-        let at = from + along * near;
-        let on_end = (start + step * near).abs() > 0.999;
-        (near > 0.0 && near <= far && on_end && at.length_squared() <= 1.0).then(|| {
+        let rounded = round(from, along).filter(|&(distance, _)| near + distance > 0.0);
+        if let Some((distance, at)) = rounded.filter(|(d, _)| (start + step * d).abs() <= 1.0) {
+            return Some(Hit { distance: near + distance, normal: (at / self.half).normalize_or(Vec3::Z) });
+        }
+        // A ray that does not come through the mantle comes through the end that faces it. Along an end `step` is 0, the
+        // distance not finite, and no comparison with it holds.
+        let axis = axis?;
+        let facing = if step > 0.0 { -1.0 } else { 1.0 };
+        let distance = (facing - start) / step;
+        let within = (from + along * distance).length_squared() <= 1.0;
+        (near + distance > 0.0 && distance < f32::INFINITY && within).then(|| {
             let mut normal = Vec3::ZERO;
-            normal[axis] = if step > 0.0 { -1.0 } else { 1.0 };
-            Hit { distance: near, normal }
+            normal[axis] = facing;
+            Hit { distance: near + distance, normal }
         })
     }
 
