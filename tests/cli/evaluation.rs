@@ -1,0 +1,186 @@
+//! Synthetic and published sets, and how networks are scored on them.
+
+use super::*;
+
+#[test]
+fn synthetic_scenes_run_and_sets_go_on() {
+    let place = Place::ready();
+    let mut street = network();
+    street.bounds = [[-20.0, 20.0], [-20.0, 20.0], [-5.3, 2.7]];
+    fs::write(place.path("street.json"), street.to_json()).unwrap();
+    let [network, drive, set] = ["street.json", "drive", "set"].map(|f| place.text(f));
+    done(&["synth", "--network", &network, "--seed", "5", "--frames", "2", "-o", &drive]);
+    let [model, scene, out] = ["model", "drive/001", "out.npz"].map(|f| place.text(f));
+    done(&["run", "--model", &model, &scene, "-o", &out]);
+    let arguments = ["synth", "--network", &network, "--seed", "5", "--count", "3", "--set", &set, "--pixels"];
+    done(&arguments);
+    let file = place.path("set/000000006.safetensors");
+    let whole = fs::read(&file).unwrap();
+    fs::remove_file(&file).unwrap();
+    done(&arguments);
+    assert!(fs::read(&file).unwrap() == whole, "the frame that was missing is made again");
+    done(&["run", "--model", &model, file.to_str().unwrap(), "-o", &out]);
+    let line = refused("set.json", &["synth", "--seed", "5", "--count", "3", "--set", &set]);
+    assert!(line.contains("other frames"), "{line}");
+    let seeds = ["synth", "--network", &network, "--seed", "999999999", "--count", "2", "--set", &set];
+    assert!(refused("", &seeds).contains("seeds below 1000000000"));
+}
+
+/// nuScenes with one key frame of the images in `samples`, and its labels of both kinds: a wall of cars 10 m ahead.
+fn write_nuscenes(root: &Path, images: &[String]) {
+    let cameras = ["CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"];
+    let (mut sensors, mut calibrated, mut egos, mut data) = (vec![], vec![], vec![], vec![]);
+    for (index, name) in cameras.into_iter().chain(["LIDAR_TOP"]).enumerate() {
+        let camera = index < cameras.len();
+        let turn = std::f64::consts::PI * index as f64 / 6.0;
+        let intrinsic = if camera { json!([[40, 0, 32], [0, 40, 16], [0, 0, 1]]) } else { json!([]) };
+        // Cameras look along +y, turned about z; the lidar's y looks along the vehicle's x.
+        let (s, c) = (turn.sin() * 0.5f64.sqrt(), turn.cos() * 0.5f64.sqrt());
+        let rotation = if camera { json!([c, -c, -s, s]) } else { json!([0.5f64.sqrt(), 0, 0, -0.5f64.sqrt()]) };
+        let file = if camera { images[index].clone() } else { "samples/LIDAR_TOP/sweep.pcd.bin".to_owned() };
+        sensors.push(json!({"token": name, "channel": name}));
+        calibrated
+            .push(json!({"token": name, "sensor_token": name, "translation": [1.1, 0, 2.1], "rotation": rotation,
+            "camera_intrinsic": intrinsic}));
+        egos.push(json!({"token": name, "translation": [5, 6, 0], "rotation": [1, 0, 0, 0]}));
+        data.push(json!({"token": name, "sample_token": "a", "ego_pose_token": name, "calibrated_sensor_token": name,
+            "filename": file, "is_key_frame": true, "height": 32, "width": 64}));
+    }
+    fs::create_dir(root.join("v1.0-mini")).unwrap();
+    for (table, rows) in [
+        ("sensor", sensors),
+        ("calibrated_sensor", calibrated),
+        ("ego_pose", egos),
+        ("sample_data", data),
+        ("scene", vec![json!({"token": "s", "name": "scene-0103"})]),
+        ("sample", vec![json!({"token": "a", "scene_token": "s", "timestamp": 7})]),
+    ] {
+        fs::write(root.join(format!("v1.0-mini/{table}.json")), json!(rows).to_string()).unwrap();
+    }
+    // 10 to 12 m ahead of the lidar, 4 m to either side, from 2 m below to 2 m above.
+    let mut rows = Vec::new();
+    for i in 0..16 * 4 * 8 {
+        rows.extend([92 + (i / 32) as u8, 120 + (i / 8 % 4) as u8, 6 + (i % 8) as u8, 4]);
+    }
+    let mut literal = format!("{{'descr': '|u1', 'fortran_order': False, 'shape': ({}, 4), }}", rows.len() / 4);
+    literal.push_str(&" ".repeat(117 - literal.len()));
+    let file = [b"\x93NUMPY\x01\x00\x76\x00", literal.as_bytes(), b"\n", &rows].concat();
+    fs::create_dir_all(root.join("occ/samples")).unwrap();
+    fs::write(root.join("occ/samples/sweep.pcd.bin.npy"), file).unwrap();
+    let mut semantics = vec![17u8; 640_000];
+    for (x, y, z) in (0..5 * 20 * 10).map(|i| (128 + i / 200, 90 + i / 10 % 20, 3 + i % 10)) {
+        semantics[(x * 200 + y) * 16 + z] = 4;
+    }
+    let mask = vec![1u8; 640_000];
+    let arrays = [("semantics", &semantics), ("mask_lidar", &mask), ("mask_camera", &mask)]
+        .map(|(name, values)| Array { name, shape: &[200, 200, 16], elements: Elements::U8(values) });
+    fs::create_dir_all(root.join("gts/scene-0103/a")).unwrap();
+    write_npz(&root.join("gts/scene-0103/a/labels.npz"), &arrays).unwrap();
+}
+
+#[test]
+fn published_sets_are_scored() {
+    let place = Place(tempfile::tempdir().unwrap());
+    let network = Network { classes: 17, cameras: 6, ..network() };
+    fs::write(place.path("model"), small::model_bytes(&network, Precision::F32, Rewrites::ALL, 3)).unwrap();
+    let scene = voxcast::demo::demo_scene(&network, 1);
+    scene.save(&place.path("samples")).unwrap();
+    let images: Vec<String> = scene.names.iter().map(|name| format!("samples/{name}.png")).collect();
+    write_nuscenes(place.0.path(), &images);
+    let (model, root) = (place.text("model"), place.0.path().to_str().unwrap());
+    let (surroundocc, occ3d) = (format!("surroundocc:{root}:{root}/occ:val"), format!("occ3d:{root}:{root}/gts"));
+    let scores = |predictor: [&str; 2], data: &str| -> Value {
+        let json = place.text("scores.json");
+        done(&["eval", predictor[0], predictor[1], "--data", data, "--json", &json]);
+        serde_json::from_slice(&fs::read(json).unwrap()).unwrap()
+    };
+    let of_model = scores(["--model", &model], &occ3d);
+    assert_eq!(of_model["frames"], 1);
+    assert_eq!(of_model["regions"].as_object().unwrap().len(), 4, "{of_model}");
+    assert_eq!(scores(["--model", &model], &surroundocc)["regions"].as_object().unwrap().len(), 2);
+    // The same wall in the frames of lidar and vehicle.
+    for predictor in [&surroundocc, &occ3d] {
+        let iou = &scores(["--majority", predictor], &occ3d)["regions"]["camera"]["iou"];
+        assert_eq!(iou.as_f64(), Some(1.0), "{predictor}");
+    }
+    let line = text(&voxcast(&["eval", "--majority", &occ3d, "--data", &surroundocc]).stderr);
+    assert!(line.contains("axes of the ego vehicle"), "{line}");
+    fs::remove_file(place.path("gts/scene-0103/a/labels.npz")).unwrap();
+    refused("gts/scene-0103/a/labels.npz", &["eval", "--model", &model, "--data", &occ3d]);
+
+    let kitti = place.path("kitti/sequences/08");
+    fs::create_dir_all(kitti.join("voxels")).unwrap();
+    fs::write(kitti.join("calib.txt"), "P2: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: 1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
+    fs::write(kitti.join("voxels/000000.label"), vec![0; 4 << 20]).unwrap();
+    let data = format!("semantickitti:{root}/kitti");
+    let line = refused("model", &["eval", "--model", &model, "--data", &data]);
+    assert!(line.contains("a model of 17 classes") && line.contains("has 20"), "{line}");
+    refused("voxels/000000.invalid", &["eval", "--majority", &data, "--data", &data]);
+}
+
+/// A model for drawn streets, and a set of four of them.
+fn street_set(place: &Place) -> [String; 2] {
+    let street = Network { classes: 17, bounds: [[-20.0, 20.0], [-20.0, 20.0], [-5.3, 2.7]], ..network() };
+    fs::write(place.path("street"), small::model_bytes(&street, Precision::F32, Rewrites::ALL, 3)).unwrap();
+    fs::write(place.path("street.json"), street.to_json()).unwrap();
+    let [network, set, model] = ["street.json", "set", "street"].map(|f| place.text(f));
+    done(&["synth", "--network", &network, "--seed", "5", "--count", "4", "--set", &set]);
+    [model, format!("synthetic:{set}")]
+}
+
+#[test]
+fn an_evaluation_that_was_stopped_goes_on() {
+    let place = Place(tempfile::tempdir().unwrap());
+    let [model, data] = street_set(&place);
+    let [journal, json, markdown] = ["scores.jsonl", "scores.json", "scores.md"].map(|f| place.text(f));
+    let base = ["eval", "--model", &model, "--data", &data, "--losses"];
+    let at_once = done(&[&base[..], &["--json", &json, "--markdown", &markdown]].concat());
+    assert!(at_once.contains("4 frames") && at_once.contains("mIoU") && at_once.contains("lovasz"), "{at_once}");
+    let whole = fs::read(&json).unwrap();
+    assert!(fs::read_to_string(&markdown).unwrap().contains("| mIoU |"));
+
+    let resumed = [&base[..], &["--resume", &journal, "--json", &json, "--workers", "2"]].concat();
+    done(&[&resumed[..], &["--limit", "2"]].concat());
+    // The second frame's line loses its end, as after a kill.
+    let bytes = fs::read(&journal).unwrap();
+    assert_eq!(bytes.iter().filter(|&&b| b == b'\n').count(), 3);
+    fs::write(&journal, &bytes[..bytes.len() - 40]).unwrap();
+    assert_eq!(done(&resumed), at_once);
+    assert!(fs::read(&json).unwrap() == whole, "the same numbers to the last bit");
+    assert_eq!(fs::read_to_string(&journal).unwrap().lines().count(), 5);
+    // All is known: nothing is computed again, and the set's images are not needed.
+    let frame = place.path("set/000000007.safetensors");
+    let kept = fs::read(&frame).unwrap();
+    fs::write(&frame, "damaged").unwrap();
+    assert_eq!(done(&resumed), at_once);
+    fs::write(&frame, kept).unwrap();
+    let line = refused("scores.jsonl", &["eval", "--model", &model, "--data", &data, "--resume", &journal]);
+    assert!(line.contains("another evaluation"), "{line}");
+    let line = refused("scores.jsonl", &[&resumed[..8], &["--json", &journal]].concat());
+    assert!(line.contains("--resume and --json write the same file"), "{line}");
+    assert_eq!(fs::read_to_string(&journal).unwrap().lines().count(), 5);
+    fs::write(place.path("notes"), "my notes\n").unwrap();
+    refused("notes", &["eval", "--model", &model, "--data", &data, "--resume", &place.text("notes")]);
+    assert_eq!(fs::read_to_string(place.path("notes")).unwrap(), "my notes\n");
+}
+
+#[test]
+fn two_models_are_compared() {
+    let place = Place(tempfile::tempdir().unwrap());
+    let [model, data] = street_set(&place);
+    let street = Network::from_json(&fs::read_to_string(place.path("street.json")).unwrap()).unwrap();
+    fs::write(place.path("half"), small::model_bytes(&street, Precision::F16, Rewrites::ALL, 3)).unwrap();
+    let [half, json, picture] = ["half", "scores.json", "confusion.png"].map(|f| place.text(f));
+    let told = done(&["eval", "--compare", &model, &half, "--data", &data, "--json", &json, "--confusion", &picture]);
+    assert!(told.contains("B - A") && told.contains("say the same of"), "{told}");
+    let scores: Value = serde_json::from_slice(&fs::read(&json).unwrap()).unwrap();
+    let equal = scores["comparison"]["equal"].as_f64().unwrap();
+    assert!((0.5..1.0).contains(&equal), "f16 weights change some voxels and not all: {equal}");
+    let alone = |model: &str| -> Value {
+        done(&["eval", "--model", model, "--data", &data, "--json", &json]);
+        serde_json::from_slice(&fs::read(&json).unwrap()).unwrap()
+    };
+    assert_eq!([alone(&model), alone(&half)].to_vec(), scores["reports"].as_array().unwrap()[..]);
+    assert_eq!(&fs::read(place.path("confusion.png")).unwrap()[..4], b"\x89PNG");
+    assert_eq!(voxcast(&["eval", "--compare", &model, "--data", &data]).status.code(), Some(2));
+}
