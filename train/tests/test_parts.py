@@ -17,6 +17,7 @@ sys.path.insert(0, str(HERE))
 import make_losses  # noqa: E402
 import made_up  # noqa: E402
 
+from voxcast_train.auxiliary import PixelHeads, PlaceHeads, places  # noqa: E402
 from voxcast_train.calibrate import fit_shifts, miou_of  # noqa: E402
 from voxcast_train.config import Config  # noqa: E402
 from voxcast_train.data import DEPTH_BINS, Frames, augment, depth_bins, order  # noqa: E402
@@ -25,6 +26,7 @@ from voxcast_train.losses import IGNORED, level_losses, lovasz_softmax, lovasz_s
 from voxcast_train.metrics import Confusion  # noqa: E402
 from voxcast_train.network import InverseMatrixVT3D, Network  # noqa: E402
 from voxcast_train.rig import Matrix, Rig  # noqa: E402
+from voxcast_train.train import rate  # noqa: E402
 
 
 class Place(unittest.TestCase):
@@ -313,6 +315,38 @@ class Metrics(Place):
         self.assertEqual(report["near seen"]["classes"], [None, None, None, 0.0])
 
 
+class TrainingHeads(Place):
+    def test_places_of_voxels(self):
+        at = places(self.network.bounds, self.network.grids[1])
+        x, y, z, logarithm = at[7, 0, 1].tolist()
+        self.assertAlmostEqual(x, 0.875, places=6)  # 14 m of 16
+        self.assertAlmostEqual(y, -0.9, places=6)  # 21.6 m of 24
+        self.assertAlmostEqual(z, 0.5, places=6)
+        self.assertAlmostEqual(logarithm, math.log((math.hypot(14.0, 21.6) + 1.0) / 25.0), places=5)
+
+    def test_places_are_learnt_from_features_that_hold_them(self):
+        heads = PlaceHeads(self.network)
+        volumes = [torch.zeros(2, channels, *grid) for channels, grid in zip(self.network.channels[1:], self.network.grids)]
+        for level, volume in enumerate(volumes):
+            volume[:, :4] = getattr(heads, f"places{level}").permute(3, 0, 1, 2)
+        for linear in heads.linear:
+            torch.nn.init.zeros_(linear.bias)
+            torch.nn.init.eye_(linear.weight)
+        self.assertAlmostEqual(heads.loss(volumes).item(), 0.0, places=10)
+        self.assertGreater(heads.loss([volume.flip(2) for volume in volumes]).item(), 0.5)
+
+    def test_place_of_a_pixel(self):
+        bins = torch.tensor([[[0, IGNORED, 31], [IGNORED] * 3]])
+        right = torch.zeros(1, 3, 2, 3)
+        right[:, 0], right[:, 1] = torch.tensor([[-1.0], [1.0]]), torch.tensor([-1.0, 0.0, 1.0])
+        right[:, 2] = torch.tensor([[1 / 32, 9.0, 63 / 32], [9.0] * 3])  # the sky has no depth
+        self.assertAlmostEqual(PixelHeads.error_of_place(right, bins).item(), 0.0, places=10)
+        right[:, 2, 0, 0] += 2.0
+        self.assertAlmostEqual(PixelHeads.error_of_place(right, bins).item(), 2.0, places=6)
+        right[:, 0] += 1.0
+        self.assertAlmostEqual(PixelHeads.error_of_place(right, bins).item(), 3.0, places=6)
+
+
 class Calibration(unittest.TestCase):
     def test_shifts_undo_a_wrong_prior(self):
         torch.manual_seed(4)
@@ -340,6 +374,12 @@ class Configs(Place):
         self.assertEqual([config.phase(step).lovasz for step in (0, 4, 5, 9)], [1.0, 1.0, 3.0, 3.0])
         self.assertEqual(config.identity(), self.config(steps=20).identity())
         self.assertNotEqual(config.identity(), self.config(batch=4).identity())
+
+    def test_the_rate_rises_again_where_volumes_come_in(self):
+        phases = [{"start": 0, "volumes": False}, {"start": 4}, {"start": 8, "lovasz": 2}]
+        config = self.config(phases=phases, warm_up=2, steps=1000)
+        warm = [round(rate(config, step), 2) for step in range(10)]
+        self.assertEqual(warm, [0.5, 1.0, 1.0, 1.0, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0])
 
     def test_faults_are_named(self):
         for changes, message in (

@@ -22,9 +22,10 @@ from voxcast_train.data import Frames  # noqa: E402
 from voxcast_train.errors import InputError  # noqa: E402
 from voxcast_train.evaluate import evaluate, evaluate_majority, load_model  # noqa: E402
 from voxcast_train.export import export  # noqa: E402
-from voxcast_train.network import InverseMatrixVT3D  # noqa: E402
+from voxcast_train.network import InverseMatrixVT3D, Network, initialise  # noqa: E402
 from voxcast_train.rig import Rig  # noqa: E402
 from voxcast_train.train import run  # noqa: E402
+from voxcast_train.unpack import restore_norms, unpack  # noqa: E402
 from voxcast_train.workers import Worker, run_workers  # noqa: E402
 
 CPU = torch.device("cpu")
@@ -160,6 +161,49 @@ class Run(unittest.TestCase):
             torch.testing.assert_close(tensor, b["average"][name], rtol=1e-4, atol=1e-5, msg=name)
         a, b = ((work / "log.jsonl").read_text().splitlines() for work in (whole, parts))
         self.assertEqual([json.loads(row)["step"] for row in a], [json.loads(row)["step"] for row in b])
+
+    def test_a_run_starts_from_a_model(self):
+        """The weights of a model file, which are folded, packed and of half precision, give the function that they came from,
+        in evaluation and in training mode; from there a run goes on, first without the volumes."""
+        source = self.work_of("source")
+        run(self.config("source", steps=60), source, CPU)
+        export(torch.load(source / "state.pt", weights_only=True)["average"], source / "checkpoint.safetensors")
+        voxcast("import", source / "checkpoint.safetensors", "--network", self.work / "network.json", "--precision", "f16", "-o", source / "model")
+        network = self.config("source").load_network()
+        rig = Rig.load(source / "rig.safetensors", network)
+        frames = Frames([source / "train"], network, pixels=True)
+        images = frames.batch(list(range(8)))["images"]
+        unpacked = InverseMatrixVT3D(network)
+        initialise(unpacked)
+        spread = unpacked.img_backbone.layer1[0].conv1.weight.std().item()
+        unpack(source / "model", unpacked)
+        self.assertAlmostEqual(unpacked.img_backbone.layer1[0].conv1.weight.std().item(), spread, places=6)
+        original = load_model(network, source / "checkpoint.safetensors")
+        with torch.no_grad():
+            expected = original(images, rig, range(4))
+            for mode in ("unpacked", "restored", "training"):
+                if mode == "restored":
+                    restore_norms(unpacked, lambda: unpacked(images, rig, range(4)))
+                unpacked.train(mode == "training")
+                for level, (a, b) in enumerate(zip(expected, unpacked(images, rig, range(4)))):
+                    with self.subTest(mode, level=level):
+                        self.assertLess(float((a - b).abs().max()), 0.02 * float(a.square().mean().sqrt()))
+
+        phases = [{"start": 0, "volumes": False}, {"start": 10}]
+        work = self.work_of("continued")
+        config = self.config("continued", steps=20, after="source.json", phases=phases, workers=2, threads=1)
+        with self.assertRaisesRegex(InputError, "source.json.*--from"):
+            run(config, work, CPU)
+        run(config, work, CPU, source / "model")
+        rows = [json.loads(line) for line in (work / "log.jsonl").read_text().splitlines()]
+        self.assertEqual(["focal0" in row for row in rows if row["kind"] == "train"], [False, True])
+        before, after = (torch.load(path / "state.pt", weights_only=True)["average"] for path in (source, work))
+        self.assertEqual(before.keys(), after.keys())
+        with self.assertRaisesRegex(InputError, "format: found None"):
+            unpack(source / "checkpoint.safetensors", unpacked)
+        other = Network.load(made_up.write_network(work, fpn=24))
+        with self.assertRaisesRegex(InputError, "fpn: found 16, expected 24"):
+            unpack(source / "model", InverseMatrixVT3D(other))
 
     def test_two_workers_share_a_batch(self):
         work = self.work_of("workers")

@@ -31,6 +31,8 @@ class Phase:
     semantic: float = 1.0
     class_power: float = 0.25
     """Class weights of the focal loss are (count of a class)^-power, scaled to a mean of 1 over the classes that occur."""
+    volumes: bool = True
+    """False: only the heads of the pixels teach, and the image half runs alone. A step takes less than half of the time."""
 
 
 @dataclass(frozen=True)
@@ -43,9 +45,12 @@ class Config:
     steps: int
     batch: int
     network: str = "network.json"
+    after: str | None = None
+    """Another config, beside this one: training starts from the model that its run gave."""
     seed: int = 0
     learning_rate: float = 2e-3
-    """Peak; reached linearly over `warm_up` steps, then falling to nothing along a cosine."""
+    """Peak; reached linearly over `warm_up` steps, then falling to nothing along a cosine. Where a phase starts to teach the
+    volumes after one that did not, the rate is reached anew."""
     warm_up: int = 200
     backbone_factor: float = 1.0
     """The backbone's learning rate over that of the rest. Fine-tuning wants 0.1."""
@@ -59,7 +64,7 @@ class Config:
     phases: tuple = (Phase(),)
     lovasz_voxels: int = 20000
     auxiliary: float = 0.5
-    """Weight of the per-pixel losses at the start; it falls to a fifth of that along a straight line."""
+    """Weight of the losses of heads that only training has; it falls to a fifth of that along a straight line."""
     precision: str = "f32"
     """`bf16` runs convolutions in bfloat16, which is faster on CPUs with AMX and on GPUs; weights stay f32."""
     workers: int = 1
@@ -99,6 +104,14 @@ class Config:
     def phase(self, step: int) -> Phase:
         """The phase that a step belongs to."""
         return [phase for phase in self.phases if phase.start <= step][-1]
+
+    def warmed_from(self, step: int) -> int:
+        """The step from which on the rate rises to that of `step`."""
+        first = 0
+        for before, phase in zip(self.phases, self.phases[1:]):
+            if phase.start <= step and phase.volumes and not before.volumes:
+                first = phase.start
+        return first
 
     def identity(self) -> dict:
         """What must not change between a run and its continuation. A run may be made longer or shorter, and get

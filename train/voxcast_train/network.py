@@ -388,12 +388,13 @@ class InverseMatrixVT3D(nn.Module):
         x = F.pad(x, (0, width - x.shape[3], 0, height - x.shape[2])).contiguous(memory_format=torch.channels_last)
         return self.img_neck(self.img_backbone(x))
 
-    def volumes(self, pyramid: list, rig: Rig, batch: int, levels=(0,)) -> list:
-        """Logits [B, X, Y, Z, classes] of each level asked for."""
-        return self.occ_head(self.view_transformer(pyramid, rig, batch), levels)
+    def volumes(self, pyramid: list, rig: Rig, batch: int) -> tuple:
+        """Refined volumes [B, C, X, Y, Z] of levels 0 to 3."""
+        return self.view_transformer(pyramid, rig, batch)
 
     def forward(self, images: Tensor, rig: Rig, levels=(0,)) -> list:
-        return self.volumes(self.pyramid(images), rig, images.shape[0], levels)
+        """Logits [B, X, Y, Z, classes] of each level asked for."""
+        return self.occ_head(self.volumes(self.pyramid(images), rig, images.shape[0]), levels)
 
 
 def x_mean(device) -> Tensor:

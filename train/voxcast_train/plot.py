@@ -36,12 +36,15 @@ def draw_curve(rows: list, path) -> None:
     training = [row for row in rows if row["kind"] == "train"]
     tuning = [row for row in rows if row["kind"] == "evaluate"]
     figure, (left, right) = plt.subplots(1, 2, figsize=(12, 4.5), layout="constrained")
-    steps = [row["step"] for row in training]
     names = {"focal0": "focal", "lovasz0": "Lovász-softmax", "geometric0": "geometric affinity", "semantic0": "semantic affinity",
-             "pixel_class": "class of a pixel", "pixel_depth": "depth of a pixel"}  # fmt: skip
+             "pixel_class": "class of a pixel", "pixel_depth": "depth of a pixel", "pixel_place": "place of a pixel",
+             "voxel_place": "place of a voxel"}  # fmt: skip
     for key, name in names.items():
-        left.plot(steps, smooth([row[key] for row in training], 15), label=name, linewidth=1.2)
-    left.set(xlabel="step", ylabel="loss (level 0, and pixels)", yscale="log", title="Training frames")
+        # Not every phase has every loss.
+        rows_with = [row for row in training if key in row]
+        if rows_with:
+            left.plot([row["step"] for row in rows_with], smooth([row[key] for row in rows_with], 15), label=name, linewidth=1.2)
+    left.set(xlabel="step", ylabel="loss (level 0, and training heads)", yscale="log", title="Training frames")
     left.legend(fontsize=8)
     left.grid(alpha=0.3)
     steps = [row["step"] for row in tuning]

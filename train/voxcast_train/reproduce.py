@@ -45,21 +45,36 @@ class Program:
             self("synth", "--set", directory, "--seed", seeds.first, "--count", seeds.count, "--network", network, "--pixels")
 
 
-def reproduce(config: Config, work: Path, voxcast: Program, device: torch.device) -> dict:
-    """Everything that the module's text says. Returns the reports of the held-out set by name."""
+def train_model(config: Config, work: Path, voxcast: Program, device: torch.device) -> int:
+    """Makes a config's sets and rig in `work`, trains, and writes checkpoint.safetensors and model.safetensors there; first, in
+    `work`/first, the run that it starts from. Returns the number of steps."""
     work.mkdir(parents=True, exist_ok=True)
+    start = None
+    if config.after is not None:
+        start = work / "first" / "model.safetensors"
+        if not start.exists():
+            train_model(Config.load(config.directory / config.after), work / "first", voxcast, device)
     network_path = config.directory / config.network
     network = config.load_network()
-    for name, seeds in (("train", config.train), ("tune", config.tune), ("held-out", config.held_out)):
+    for name, seeds in (("train", config.train), ("tune", config.tune)):
         voxcast.make_set(work / name, seeds, network_path)
     first = next(iter(sorted((work / "train").glob("[0-9]*.safetensors"))))
     voxcast("rig", first, "--network", network_path, "-o", work / "rig.safetensors")
-    run(config, work, device)
+    run(config, work, device, start)
     state = torch.load(work / "state.pt", map_location="cpu", weights_only=True)
     rig = Rig.load(work / "rig.safetensors", network)
     tuning = Frames([work / "tune"], network, pixels=False, limit=config.tune.count)
     export(calibrated(state["average"], network, rig, tuning), work / "checkpoint.safetensors")
     voxcast("import", work / "checkpoint.safetensors", "--network", network_path, "--precision", "f16", "-o", work / "model.safetensors")
+    return state["step"]
+
+
+def reproduce(config: Config, work: Path, voxcast: Program, device: torch.device) -> dict:
+    """Everything that the module's text says. Returns the reports of the held-out set by name."""
+    steps = train_model(config, work, voxcast, device)
+    network = config.load_network()
+    voxcast.make_set(work / "held-out", config.held_out, config.directory / config.network)
+    rig = Rig.load(work / "rig.safetensors", network)
     held_out = Frames([work / "held-out"], network, pixels=False, limit=config.held_out.count)
     majority = Frames([work / "train"], network, pixels=False, limit=config.train.count).majority()
     model = load_model(network, work / "checkpoint.safetensors").to(device)
@@ -67,7 +82,7 @@ def reproduce(config: Config, work: Path, voxcast: Program, device: torch.device
         "network": evaluate(model, rig.to(device), held_out, device).report(),
         "majority": evaluate_majority(majority, held_out).report(),
     }
-    text = json.dumps({"frames": len(held_out), "steps": state["step"], **reports}, indent=1) + "\n"
+    text = json.dumps({"frames": len(held_out), "steps": steps, **reports}, indent=1) + "\n"
     replace(work / "quality.json", lambda temporary: temporary.write_text(text))
     return reports
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from .auxiliary import PixelHeads
+from .auxiliary import AuxiliaryHeads
 from .config import Config
 from .data import Frames, augment, order
 from .errors import InputError
@@ -27,14 +27,18 @@ from .losses import LEVEL_WEIGHTS, level_losses
 from .network import InverseMatrixVT3D, initialise
 from .plot import draw_curve
 from .rig import Rig
+from .unpack import restore_norms, unpack
 from .workers import Worker, run_workers
 
 FINAL_AUXILIARY = 0.2
 
+START_FRAMES = 16
+"""Frames that the statistics of batch norms are measured on when training starts from a model."""
+
 
 def rate(config: Config, step: int) -> float:
     """Learning rate of a step over the peak."""
-    warm = min(1.0, (step + 1) / max(1, config.warm_up))
+    warm = min(1.0, (step + 1 - config.warmed_from(step)) / max(1, config.warm_up))
     return warm * 0.5 * (1.0 + math.cos(math.pi * min(1.0, step / config.steps)))
 
 
@@ -70,7 +74,7 @@ class Training:
         for module in self.model.modules():
             if isinstance(module, (nn.BatchNorm2d, nn.BatchNorm3d)):
                 module.momentum = config.momentum
-        self.heads = PixelHeads(network)
+        self.heads = AuxiliaryHeads(network)
         self.model.to(device)
         self.heads.to(device)
         self.average = InverseMatrixVT3D(network).to(device).requires_grad_(False)
@@ -119,23 +123,28 @@ class Training:
         torch.manual_seed((config.seed * 1_000_003 + self.step) * worker.count + worker.rank)
         batch = frames.batch(order(config.seed, len(frames), self.batch, self.step))
         images = augment(batch["images"]).to(self.device)
+        phase = config.phase(self.step)
+        truth = [batch[name].to(self.device) for name in ("pixel_class", "pixel_depth")]
         with self.autocast():
             pyramid = self.model.pyramid(images)
-            logits = self.model.volumes(pyramid, self.rig, self.batch, levels=range(4))
-            of_class, of_depth = self.heads.losses(pyramid, batch["pixel_class"].to(self.device), batch["pixel_depth"].to(self.device))
-        parts = {}
-        phase = config.phase(self.step)
-        weights = class_weights(counts, phase.class_power).to(self.device)
-        total = self.auxiliary_weight() * (of_class + of_depth)
-        for level, level_weight in enumerate(LEVEL_WEIGHTS):
-            losses = level_losses(logits[level], batch["labels"][level].to(self.device), weights, config.lovasz_voxels)
-            total = total + level_weight * sum(getattr(phase, name) * loss for name, loss in losses.items())
-            parts.update({f"{name}{level}": loss for name, loss in losses.items()})
+            auxiliary = {f"pixel_{name}": loss for name, loss in self.heads.pixels.losses(pyramid, *truth).items()}
+            if phase.volumes:
+                volumes = self.model.volumes(pyramid, self.rig, self.batch)
+                auxiliary["voxel_place"] = self.heads.places.loss(volumes[1:])
+                logits = self.model.occ_head(volumes, range(4))
+        parts = dict(auxiliary)
+        total = self.auxiliary_weight() * sum(auxiliary.values())
+        if phase.volumes:
+            weights = class_weights(counts, phase.class_power).to(self.device)
+            for level, level_weight in enumerate(LEVEL_WEIGHTS):
+                losses = level_losses(logits[level], batch["labels"][level].to(self.device), weights, config.lovasz_voxels)
+                total = total + level_weight * sum(getattr(phase, name) * loss for name, loss in losses.items())
+                parts.update({f"{name}{level}": loss for name, loss in losses.items()})
         for group in self.optimiser.param_groups:
             group["lr"] = config.learning_rate * group["factor"] * rate(config, self.step)
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()
-        parameters = [p for group in self.optimiser.param_groups for p in group["params"]]
+        parameters = [p for group in self.optimiser.param_groups for p in group["params"] if p.grad is not None]
         worker.average_gradients(parameters)
         norm = nn.utils.clip_grad_norm_(parameters, config.clip)
         if not bool(norm.isfinite()):
@@ -143,7 +152,7 @@ class Training:
         self.optimiser.step()
         self._update_average()
         self.step += 1
-        values = {"total": total, "pixel_class": of_class, "pixel_depth": of_depth, "gradient": norm, **parts}
+        values = {"total": total, "gradient": norm, **parts}
         return {name: float(value.detach()) for name, value in values.items()}
 
     def row(self, kind: str, **values) -> dict:
@@ -159,6 +168,15 @@ class Training:
         decay = min(self.config.average, (1.0 + self.step) / (10.0 + self.step))
         with torch.no_grad():
             torch._foreach_lerp_(self.averaged, self.trained, 1.0 - decay)
+
+    def start_from(self, path: Path, frames: Frames) -> None:
+        """Takes the weights of a model file. Raises InputError if it belongs to another network."""
+        unpack(path, self.model)
+        with torch.no_grad():
+            images = frames.batch(list(range(min(START_FRAMES, len(frames)))))["images"].to(self.device)
+            restore_norms(self.model, lambda: self.model(images, self.rig, range(4)))
+        self.worker.copy_first([*self.model.parameters(), *self.model.buffers()])
+        self.average.load_state_dict(self.model.state_dict())
 
     def save(self, path: Path) -> None:
         state = {
@@ -204,15 +222,18 @@ class Log:
 
 
 def mean_of(rows: list) -> dict:
-    return {key: round(sum(row[key] for row in rows) / len(rows), 6) for key in rows[0]}
+    """Means by name, each over the rows that have it."""
+    names = {name: [row[name] for row in rows if name in row] for row in rows for name in row}
+    return {name: round(sum(values) / len(values), 6) for name, values in names.items()}
 
 
-def run(config: Config, work: Path, device: torch.device) -> None:
-    """Trains until the last step, from the saved state if there is one."""
-    run_workers(config.workers, run_worker, (config, work, device))
+def run(config: Config, work: Path, device: torch.device, start: Path | None = None) -> None:
+    """Trains until the last step, from the saved state if there is one, else from the weights of the model file `start`,
+    else from nothing."""
+    run_workers(config.workers, run_worker, (config, work, device, start))
 
 
-def run_worker(config: Config, work: Path, device: torch.device, worker: Worker) -> None:
+def run_worker(config: Config, work: Path, device: torch.device, start: Path | None, worker: Worker) -> None:
     torch.set_num_threads(config.threads)
     network = config.load_network()
     rig = Rig.load(work / "rig.safetensors", network)
@@ -225,6 +246,10 @@ def run_worker(config: Config, work: Path, device: torch.device, worker: Worker)
     tuning = Frames([work / "tune"], network, False, config.tune.count, share)
     if frames.available != config.train.count:
         raise InputError(f"{work / 'train'}: found {frames.available} frames, expected {config.train.count} of the config")
+    if config.after is not None and start is None and not state.exists():
+        raise InputError(f'"after": the run starts from the model of {config.after}; give it with --from')
+    if start is not None and not state.exists():
+        training.start_from(start, frames)
     counts = worker.sum(frames.class_counts())
     log = Log(work / "log.jsonl", training.step) if worker.first else None
     if worker.first:
@@ -256,10 +281,11 @@ def run_worker(config: Config, work: Path, device: torch.device, worker: Worker)
 
 def report_progress(config: Config, training: Training, row: dict) -> None:
     left = (config.steps - training.step) * training.seconds / training.step
+    shown = ("total", "focal0", "lovasz0", "geometric0", "semantic0", "pixel_class", "pixel_depth", "pixel_place", "voxel_place")
+    losses = "  ".join(f"{name} {row[name]:.3f}" for name in shown if name in row)
     print(
-        f"step {training.step}/{config.steps}  total {row['total']:.3f}  focal {row['focal0']:.4f}  lovasz {row['lovasz0']:.3f}  "
-        f"geometric {row['geometric0']:.3f}  semantic {row['semantic0']:.3f}  pixel {row['pixel_class']:.3f} {row['pixel_depth']:.3f}  "
-        f"gradient {row['gradient']:.2f}  {training.seconds / training.step:.3f} s a step, {left / 60.0:.0f} min left",
+        f"step {training.step}/{config.steps}  {losses}  gradient {row['gradient']:.2f}  "
+        f"{training.seconds / training.step:.3f} s a step, {left / 60.0:.0f} min left",
         flush=True,
     )
 
@@ -269,9 +295,10 @@ def main() -> int:
     parser.add_argument("--config", required=True, help="the run's JSON, beside its network.json")
     parser.add_argument("--work", required=True, type=Path, help="holds train/, tune/ and rig.safetensors; receives the results")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--from", dest="start", type=Path, metavar="MODEL", help="start from the weights of a model file")
     options = parser.parse_args()
     try:
-        run(Config.load(options.config), options.work, torch.device(options.device))
+        run(Config.load(options.config), options.work, torch.device(options.device), options.start)
     except (InputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

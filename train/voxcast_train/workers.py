@@ -33,6 +33,12 @@ class Worker:
             dist.all_reduce(tensor)
         return tensor
 
+    def copy_first(self, tensors) -> None:
+        """Replaces tensors by those of the first worker."""
+        if self.count > 1:
+            for tensor in tensors:
+                dist.broadcast(tensor.detach(), 0)
+
     def average_gradients(self, parameters: list) -> None:
         """Replaces each gradient by its mean over all workers, in one exchange."""
         if self.count == 1:
