@@ -45,7 +45,7 @@ def draw_curve(rows: list, path) -> None:
         if rows_with:
             left.plot([row["step"] for row in rows_with], smooth([row[key] for row in rows_with], 15), label=name, linewidth=1.2)
     left.set(xlabel="step", ylabel="loss (level 0, and training heads)", yscale="log", title="Training frames")
-    left.legend(fontsize=8)
+    left.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4)
     left.grid(alpha=0.3)
     steps = [row["step"] for row in tuning]
     for part, style in (("all", "-"), ("seen", "--")):
