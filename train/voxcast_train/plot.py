@@ -59,17 +59,18 @@ def draw_curve(rows: list, path) -> None:
 
 
 def draw_front(points: list, path) -> None:
-    """Quality against the time of a frame, a point per network."""
-    figure, axes = plt.subplots(figsize=(7, 4.5), layout="constrained")
-    for key, name, marker in (("miou", "mIoU", "o"), ("iou", "IoU", "s")):
-        axes.scatter([p["milliseconds"] for p in points], [p[key] for p in points], marker=marker, label=name)
-        for point in points:
+    """Quality against the time of a frame, a colour per network; mIoU at the left, IoU at the right."""
+    figure, panels = plt.subplots(1, 2, figsize=(11, 4.5), layout="constrained")
+    for axes, key, name in zip(panels, ("miou", "iou"), ("mIoU", "IoU")):
+        for number, point in enumerate(points):
             label = f"{point['name']}, {point['megabytes']:.1f} MB" + (" (shipped)" if point.get("shipped") else "")
-            axes.annotate(label, (point["milliseconds"], point[key]), xytext=(6, 4), textcoords="offset points", fontsize=8)
-    axes.set(xlabel="milliseconds a frame (six cameras)", ylabel="percent, held-out seeds", xlim=(0, None), ylim=(0, None))
-    axes.margins(x=0.25)
-    axes.legend()
-    axes.grid(alpha=0.3)
+            axes.scatter(point["milliseconds"], point[key], s=60, color=f"C{number}", label=label)
+            axes.annotate(f"{point[key]:.1f}", (point["milliseconds"], point[key]), xytext=(8, -3), textcoords="offset points")
+        longest, best = (max(point[k] for point in points) for k in ("milliseconds", key))
+        axes.set(xlabel="milliseconds a frame (six cameras)", ylabel="percent, held-out seeds", title=name)
+        axes.set(xlim=(0, 1.2 * longest), ylim=(0, min(100.0, 1.2 * best)))
+        axes.grid(alpha=0.3)
+    panels[0].legend(loc="lower left", fontsize=8)
     save(figure, path)
 
 

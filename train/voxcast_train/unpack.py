@@ -106,6 +106,13 @@ def unpack(path, model: InverseMatrixVT3D) -> None:
         mine = json.loads(json.dumps(getattr(network, key)))
         if packed.network.get(key) != mine:
             raise InputError(f"{path}: {key}: found {packed.network.get(key)}, expected {mine} of the network")
+    try:
+        fill_all(packed, model)
+    except RuntimeError as error:
+        raise InputError(f"{path}: a tensor has not the length that the network asks for: {error}") from error
+
+
+def fill_all(packed: Packed, model: InverseMatrixVT3D) -> None:
     norms = norms_of(model)
     for name, module in model.named_modules():
         if isinstance(module, CascadedGroupAttention):
@@ -120,8 +127,12 @@ def unpack(path, model: InverseMatrixVT3D) -> None:
             module.weight.copy_(packed[f"{name}.weight"][: module.in_channels].view_as(module.weight))
             module.bias.copy_(packed[f"{name}.bias"][:1])
             continue
-        read = packed.transposed if isinstance(module, nn.ConvTranspose3d) else packed.depthwise if module.groups > 1 else packed.convolution
-        weight = read(name, module.weight)
+        if isinstance(module, nn.ConvTranspose3d):
+            weight = packed.transposed(name, module.weight)
+        elif module.groups > 1:
+            weight = packed.depthwise(name, module.weight)
+        else:
+            weight = packed.convolution(name, module.weight)
         if name not in norms:
             module.weight.copy_(weight)
             if module.bias is not None:
