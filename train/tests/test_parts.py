@@ -389,6 +389,7 @@ class Configs(Place):
             ({"nonsense": 1}, "nonsense"),
             ({"precision": "f16"}, "precision"),
             ({"workers": 3}, "multiple of the 3 workers"),
+            ({"after": "config.json"}, "after.*itself"),
             ({"train": {"first": 0}}, "count"),
         ):
             with self.subTest(changes), self.assertRaisesRegex(InputError, message):

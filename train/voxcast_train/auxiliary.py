@@ -51,7 +51,8 @@ class PixelHeads(nn.Module):
             counted = F.cross_entropy(logits[:, self.classes :], bins, ignore_index=IGNORED, reduction="sum")
             of_depth.append(counted / (bins != IGNORED).sum().clamp(min=1))
             of_place.append(self.error_of_place(linear(features).float(), bins[:, 1::2, 1::2]))
-        return {name: torch.stack(all).mean() for name, all in (("class", of_class), ("depth", of_depth), ("place", of_place))}
+        levels = {"class": of_class, "depth": of_depth, "place": of_place}
+        return {name: torch.stack(losses).mean() for name, losses in levels.items()}
 
     @staticmethod
     def error_of_place(found: Tensor, bins: Tensor) -> Tensor:

@@ -94,6 +94,8 @@ class Config:
         starts = [phase.start for phase in config.phases]
         if starts[:1] != [0] or starts != sorted(set(starts)):
             raise InputError(f'{path}: "phases": found starts {starts}, expected ascending ones from 0 on')
+        if config.after == path.name:
+            raise InputError(f'{path}: "after": found the run itself, expected another one')
         if config.batch % config.workers != 0:
             raise InputError(f'{path}: "batch": found {config.batch}, expected a multiple of the {config.workers} workers')
         return config

@@ -2,6 +2,7 @@
 
     python -m voxcast_train.reproduce --config edge/config.json --work DIR --voxcast ../target/release/voxcast
 
+A run that starts from another one's model (`"after"`) finds that in DIR/first/model.safetensors, or makes it there.
 What DIR already holds is kept, so a run that was interrupted goes on. DIR needs about 2 MB a frame.
 """
 

@@ -1,6 +1,6 @@
 """Trains a network.
 
-    python -m voxcast_train.train --config edge/config.json --work DIR
+    python -m voxcast_train.train --config edge/config.json --work DIR --from MODEL
 
 DIR holds `train/` and `tune/` (sets of `voxcast synth`) and `rig.safetensors`. The run writes `state.pt` (everything needed to
 continue), `log.jsonl` and `curve.png` there. Started again, it continues where the last saved state was; every random draw

@@ -1,9 +1,9 @@
 """Reads a voxcast model file back into weights that can be trained.
 
-A model has its batch norms folded and its matrices packed (docs/format.md). Unpacked, every convolution has its folded weights;
-the batch norm behind it only adds the folded bias. That is the model's function in evaluation
-mode. Training normalises by the statistics of the batch, so `restore_norms` then measures what every batch norm sees and gives
-it the scale and shift that undo the normalisation. The function stays, and training goes on from it.
+A model has its batch norms folded and its matrices packed (docs/format.md). Unpacked, every convolution has its folded weights,
+and the batch norm behind it only adds the folded bias. That is the model's function in evaluation mode. Training
+normalises by the statistics of the batch, so `restore_norms` then measures what every batch norm sees and gives it the scale
+and shift that undo the normalisation. The function stays, and training goes on from it.
 """
 
 import json
@@ -85,11 +85,10 @@ class Packed:
         return self[f"{name}.bias"][:channels]
 
 
-def norms_of(model: nn.Module) -> tuple:
-    """Convolutions that a batch norm follows, as {name: name of the norm}."""
+def norms_of(model: nn.Module) -> dict:
+    """Names of the convolutions that a batch norm follows, and of that norm."""
     norms = {}
-    modules = dict(model.named_modules())
-    for name, module in modules.items():
+    for name, module in model.named_modules():
         if isinstance(module, (nn.BatchNorm2d, nn.BatchNorm3d)):
             parent, _, own = name.rpartition(".")
             before = {"bn": "c", "bn1": "conv1", "bn2": "conv2", "bn3": "conv3"}.get(own) or str(int(own) - 1)
