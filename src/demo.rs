@@ -3,8 +3,8 @@
 //! Only additions, multiplications, divisions and square roots take part, in a fixed order per pixel, so that a seed gives
 //! the same bytes on every machine and thread count.
 
+use crate::base::random::Random;
 use crate::network::Network;
-use crate::random::Random;
 use crate::scene::{Image, Scene, forward_of};
 use glam::{DVec3, Vec3};
 use std::collections::BTreeMap;

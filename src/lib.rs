@@ -103,48 +103,40 @@ import(&checkpoint, &network, Options::default(), Path::new("model.safetensors")
 //!
 //! Without features the library reads models, rigs and `.safetensors` scenes, and runs them.
 
-mod arena;
-mod backing;
-pub mod camera;
+pub mod base;
 #[cfg(feature = "capi")]
 mod capi;
-#[cfg(feature = "import")]
-pub mod checkpoint;
-pub mod compare;
-pub mod container;
-#[cfg(feature = "eval")]
-pub mod dataset;
+pub mod check;
 pub mod demo;
-pub mod digest;
-pub mod error;
 #[cfg(feature = "eval")]
 pub mod eval;
-mod exec;
+pub mod file;
 pub mod graph;
-mod heap;
-#[cfg(feature = "html")]
-pub mod html;
 pub mod image;
-pub mod import;
-#[cfg(feature = "npz")]
-pub mod labels;
 pub mod model;
 pub mod network;
-#[cfg(feature = "npz")]
-pub mod npz;
-#[cfg(feature = "images")]
-pub mod picture;
-pub mod plan;
-pub mod random;
-mod replace;
 pub mod rig;
+pub mod runtime;
 pub mod scene;
-pub mod seeded;
-pub mod selftest;
-pub mod session;
+pub mod show;
 pub mod synth;
-pub mod threads;
-pub mod weights;
+
+pub use base::{digest, error, random, threads};
+pub use check::{compare, selftest};
+#[cfg(feature = "eval")]
+pub use eval::dataset;
+pub use file::container;
+#[cfg(feature = "npz")]
+pub use file::{labels, npz};
+#[cfg(feature = "import")]
+pub use model::checkpoint;
+pub use model::{import, parts as weights, seeded};
+pub use runtime::{plan, session};
+pub use scene::camera;
+#[cfg(feature = "html")]
+pub use show::html;
+#[cfg(feature = "images")]
+pub use show::picture;
 
 pub use error::{Error, ErrorKind, Result};
 pub use image::ImageView;

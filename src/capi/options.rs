@@ -3,8 +3,8 @@
 use super::pointers::{sized, text};
 use super::status::{Failure, Outcome, invalid};
 use super::types::{MAX_THREADS, Options, Status};
-use crate::session::SessionOptions;
-use crate::threads::Threads;
+use crate::base::threads::Threads;
+use crate::runtime::session::SessionOptions;
 use voxcast_kernels::{Isa, IsaError};
 
 /// The options at `options`, the default ones if it is null.

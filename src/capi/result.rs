@@ -4,7 +4,7 @@ use super::pointers::{Room, Text};
 use super::session::SessionHandle;
 use super::status::{Failure, Outcome, call, given, own};
 use super::types::{Camera, Status};
-use crate::session::{CameraStatus, Occupancy, Session};
+use crate::runtime::session::{CameraStatus, Occupancy, Session};
 use std::ffi::c_char;
 use std::mem::MaybeUninit;
 

@@ -7,7 +7,7 @@ use super::rig::RigHandle;
 use super::status::{Outcome, call, free, given, invalid, make, own};
 use super::types::{BUDGETS, Image, ORDERS, Options, STEPS};
 use crate::image::{ChannelOrder, ImageView};
-use crate::session::{Budget, Session, Step};
+use crate::runtime::session::{Budget, Session, Step};
 use std::ffi::c_char;
 use std::mem::MaybeUninit;
 use std::sync::Mutex;

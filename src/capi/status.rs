@@ -2,7 +2,7 @@
 
 use super::pointers::Text;
 use super::types::Status;
-use crate::error::{Error, ErrorKind};
+use crate::base::error::{Error, ErrorKind};
 use std::any::Any;
 use std::borrow::Cow;
 use std::ffi::c_char;

@@ -6,7 +6,7 @@
 use super::losses::Losses;
 use super::ray_iou::RayCounts;
 use super::{Confusion, FrameScore, Kind, LossSum, Score};
-use crate::error::{Error, ErrorKind, Result};
+use crate::base::error::{Error, ErrorKind, Result};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::fs::{File, OpenOptions, TryLockError};

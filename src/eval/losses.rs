@@ -3,7 +3,7 @@
 //!
 //! `docs/evaluation.md` has the formulas.
 
-use crate::dataset::IGNORED;
+use crate::eval::dataset::IGNORED;
 
 /// A term -ln q is cut off here, as PyTorch's binary cross-entropy does.
 const MAX_LOG: f64 = 100.0;

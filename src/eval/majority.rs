@@ -1,7 +1,7 @@
 //! The image-blind baseline: what mostly stands in each voxel, whatever the cameras see.
 
-use crate::dataset::{DataSet, IGNORED};
-use crate::error::{Error, ErrorKind, Result};
+use crate::base::error::{Error, ErrorKind, Result};
+use crate::eval::dataset::{DataSet, IGNORED};
 
 /// The class that most frames of `set` have in each voxel; of equally frequent ones the first. Voxels that no frame has a
 /// label for are empty. The voxels are those of `set`'s grid, with its axes. `done` is told how many frames were read.
@@ -32,7 +32,7 @@ pub fn majority(set: &dyn DataSet, done: &mut dyn FnMut(usize)) -> Result<Vec<u8
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::{Axes, Frame, Grid, Pose, Truth};
+    use crate::eval::dataset::{Axes, Frame, Grid, Pose, Truth};
 
     /// Labels of three frames of five voxels.
     struct Three;

@@ -5,7 +5,7 @@
 //! meets an ignored one first, does not count. Of the others, a hit is one of the same class whose distance differs by less
 //! than a threshold; RayIoU of a class is hits / (labelled + predicted - hits). Misses of the prediction are no class.
 
-use crate::dataset::{Grid, IGNORED};
+use crate::eval::dataset::{Grid, IGNORED};
 
 /// Thresholds in metres.
 pub const THRESHOLDS: [f64; 3] = [1.0, 2.0, 4.0];
@@ -155,7 +155,7 @@ fn first_hit(grid: &Grid, classes: &[u8], origin: &[f64; 3], direction: &[f64; 3
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::Axes;
+    use crate::eval::dataset::Axes;
 
     const GRID: Grid = Grid { size: [8, 4, 2], bounds: [[0.0, 8.0], [-2.0, 2.0], [-1.0, 1.0]], axes: Axes::Lidar };
 
@@ -194,7 +194,7 @@ mod tests {
 
     #[test]
     fn walking_meets_what_small_steps_meet() {
-        let mut random = crate::random::Random::new(5);
+        let mut random = crate::base::random::Random::new(5);
         let classes: Vec<u8> = (0..GRID.voxels()).map(|_| u8::from(random.range(0.0, 1.0) < 0.1)).collect();
         for ray in directions().iter().step_by(37) {
             let origin = [4.2, 0.3, 0.1];

@@ -1,5 +1,5 @@
 use super::*;
-use crate::dataset::{Axes, Pose};
+use crate::eval::dataset::{Axes, Pose};
 
 const TRUTH: Grid = Grid { size: [4, 4, 2], bounds: [[-4.0, 4.0], [-4.0, 4.0], [-1.0, 1.0]], axes: Axes::Lidar };
 

@@ -1,9 +1,9 @@
 //! Sound containers that are no sound models.
 
 use super::*;
-use crate::container;
-use crate::import::import;
-use crate::seeded::SeededWeights;
+use crate::file::container;
+use crate::model::import::import;
+use crate::model::seeded::SeededWeights;
 use std::sync::OnceLock;
 
 fn network() -> Network {

@@ -1,8 +1,8 @@
 //! Rigs as files: plain CSR tensors in safetensors, which other programs write too.
 
 use super::{Csr, Rig, Storage, Tensors};
-use crate::container::{self, Container, Data, Layout, Tensor};
-use crate::error::{Error, ErrorKind, Result};
+use crate::base::error::{Error, ErrorKind, Result};
+use crate::file::container::{self, Container, Data, Layout, Tensor};
 use crate::network::Network;
 use safetensors::Dtype;
 use std::borrow::Cow;

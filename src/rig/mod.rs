@@ -12,7 +12,7 @@ mod view;
 
 pub use build::RigBuilder;
 
-use crate::container::Container;
+use crate::file::container::Container;
 use std::ops::Range;
 
 /// A 0/1 matrix in compressed sparse rows: row `r` holds the columns `col[ptr[r]..ptr[r + 1]]`, strictly ascending.

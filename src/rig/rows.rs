@@ -1,6 +1,6 @@
 //! Rows of a matrix in the making: the set of a row's pixels, and rows one after the other.
 
-use crate::error::{Error, ErrorKind, Result};
+use crate::base::error::{Error, ErrorKind, Result};
 
 pub(super) fn too_many_entries() -> Error {
     Error::new(ErrorKind::TooLarge, "a projection matrix has more entries than 32 bits count")

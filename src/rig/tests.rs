@@ -1,10 +1,10 @@
 //! The fast builder against a naive one, and the file format against damage.
 
 use super::*;
-use crate::container::{self, Data, Layout, Tensor};
-use crate::error::{Error, ErrorKind};
+use crate::base::error::{Error, ErrorKind};
+use crate::base::threads::Threads;
+use crate::file::container::{self, Data, Layout, Tensor};
 use crate::network::{Network, Sampling};
-use crate::threads::Threads;
 use proptest::prelude::*;
 use safetensors::Dtype;
 use std::collections::{BTreeMap, BTreeSet};

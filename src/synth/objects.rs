@@ -2,7 +2,7 @@
 
 use super::solid::{Part, Shape};
 use super::texture::{Finish, any_colour, hex, pick};
-use crate::random::Random;
+use crate::base::random::Random;
 use glam::Vec3;
 
 /// Classes of objects, as in SPEC's list for nuScenes.

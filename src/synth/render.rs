@@ -5,7 +5,7 @@ use super::solid::Part;
 use super::street::class;
 use super::texture::{pick, smooth};
 use super::world::World;
-use crate::random::Random;
+use crate::base::random::Random;
 use crate::scene::Image;
 use glam::{Vec2, Vec3};
 

@@ -4,7 +4,7 @@
 //! the world, in which the road starts out along x.
 
 use super::texture::{fraction, pick, smooth, speckle};
-use crate::random::Random;
+use crate::base::random::Random;
 use glam::{Vec2, Vec3};
 
 /// Classes of the ground, as in SPEC's list for nuScenes.

@@ -27,7 +27,7 @@ fn bytes(frame: &Frame) -> Vec<u8> {
 #[test]
 fn a_seed_gives_the_bytes_that_it_always_gave() {
     let synthesiser = Synthesiser::new(&small()).expect("17 classes");
-    let digest = |frame: &Frame| format!("{:016x}", crate::digest::bytes(&bytes(frame)));
+    let digest = |frame: &Frame| format!("{:016x}", crate::base::digest::bytes(&bytes(frame)));
     let found = [digest(&synthesiser.frame(1)), digest(&synthesiser.frame(2)), digest(&synthesiser.frame_of(2, 3, 8))];
     assert_eq!(found, PINNED, "models were trained on the worlds that seeds gave");
     assert_eq!(bytes(&synthesiser.frame(1)), bytes(&synthesiser.frame(1)));
@@ -205,7 +205,7 @@ fn what_cannot_be_is_refused() {
 #[cfg(all(feature = "images", feature = "npz"))]
 #[test]
 fn files_are_scenes_and_hold_what_the_frame_has() {
-    use crate::npz::{OwnedElements, read_npz};
+    use crate::file::npz::{OwnedElements, read_npz};
     let directory = tempfile::tempdir().expect("a directory");
     let network = small();
     let synthesiser = Synthesiser::new(&network).expect("17 classes");

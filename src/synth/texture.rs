@@ -1,6 +1,6 @@
 //! What surfaces look like: colours and patterns, none of which belongs to one class alone.
 
-use crate::random::Random;
+use crate::base::random::Random;
 use glam::Vec3;
 
 /// The pattern on a part's colour.

@@ -4,7 +4,7 @@ use super::objects::{self, Model, class};
 use super::solid::{Hit, Object, slab};
 use super::street::{LANE, PARKING, Street, Use};
 use super::texture::pick;
-use crate::random::Random;
+use crate::base::random::Random;
 use glam::{Vec2, Vec3};
 
 /// Metres of street behind the first and before the last place of the ego vehicle.

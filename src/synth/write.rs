@@ -1,9 +1,9 @@
 //! Frames as files: scenes with their labels, and sets to train on.
 
 use super::{CLASSES, Frame, Synthesiser};
-use crate::container::{self, Data, Layout, Tensor};
-use crate::error::{Error, ErrorKind, Result};
-use crate::replace::replace_file;
+use crate::base::error::{Error, ErrorKind, Result};
+use crate::file::container::{self, Data, Layout, Tensor};
+use crate::file::replace::replace_file;
 use half::f16;
 use safetensors::Dtype;
 use std::collections::BTreeMap;
@@ -57,10 +57,10 @@ impl Frame {
     /// # Errors
     /// [`ErrorKind::Io`] if the directory or a file cannot be written.
     pub fn save_scene(&self, directory: &Path, grid: [usize; 3]) -> Result<()> {
-        use crate::npz::{Array, Elements};
+        use crate::file::npz::{Array, Elements};
         self.scene.save(directory)?;
         let array = |name, bytes| Array { name, shape: &grid, elements: Elements::U8(bytes) };
-        crate::npz::write_npz(
+        crate::file::npz::write_npz(
             &directory.join("labels.npz"),
             &[array("classes", &self.labels[..]), array("visible", &self.visible[..])],
         )?;

@@ -4,7 +4,7 @@ use serde_json::json;
 use std::path::Path;
 use voxcast_viewer::{Browser, DESK};
 
-const MESH: &str = include_str!("../../../src/html/mesh.js");
+const MESH: &str = include_str!("../../../src/show/html/mesh.js");
 
 /// Random grids of solid voxels and ghosts, and helpers.
 const SETUP: &str = "

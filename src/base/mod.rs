@@ -1,0 +1,6 @@
+//! What every other room may use: errors, digests, seeded random numbers, threads.
+
+pub mod digest;
+pub mod error;
+pub mod random;
+pub mod threads;

@@ -1,0 +1,156 @@
+//! Data sets to evaluate on: frames of images with the class of every voxel, from the files as they are published.
+//!
+//! A [`DataSet`] is a list of frames that can be read in any order, from several threads at once; nothing is kept between
+//! frames but the index. Labels are classes of the network's training, [`IGNORED`] where there is no truth.
+
+pub mod nuscenes;
+mod pose;
+pub mod semantickitti;
+mod synthetic;
+
+pub use nuscenes::NuScenes;
+pub use pose::Pose;
+pub use semantickitti::SemanticKitti;
+pub use synthetic::Synthetic;
+
+use crate::base::error::{Error, Result};
+use crate::network::Network;
+use crate::scene::Scene;
+use std::path::{Component, Path};
+
+/// Label of a voxel about which nothing is known, or which no score counts.
+pub const IGNORED: u8 = crate::file::labels::UNLABELLED;
+
+/// Where voxels lie: how many along each axis, and their metres in some frame of reference.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Grid {
+    /// Voxels along x, y, z.
+    pub size: [usize; 3],
+    /// [min, max] of x, of y, of z in metres.
+    pub bounds: [[f32; 2]; 3],
+    /// In whose frame these are.
+    pub axes: Axes,
+}
+
+impl Grid {
+    /// The output grid of a network.
+    pub fn of(network: &Network) -> Self {
+        Self { size: network.output_grid(), bounds: network.bounds, axes: Axes::Lidar }
+    }
+
+    /// Voxels in all.
+    pub fn voxels(&self) -> usize {
+        self.size.iter().product()
+    }
+
+    /// Edge of a voxel along `axis` in metres.
+    pub fn edge(&self, axis: usize) -> f64 {
+        let [low, high] = self.bounds[axis].map(f64::from);
+        (high - low) / self.size[axis] as f64
+    }
+
+    /// Centre of the voxels at `index` along `axis`, in metres.
+    pub fn centre(&self, axis: usize, index: usize) -> f64 {
+        f64::from(self.bounds[axis][0]) + (index as f64 + 0.5) * self.edge(axis)
+    }
+
+    /// Index along `axis` of the voxels that contain `metres`; none outside.
+    pub fn index(&self, axis: usize, metres: f64) -> Option<usize> {
+        let index = ((metres - f64::from(self.bounds[axis][0])) / self.edge(axis)).floor();
+        (index >= 0.0 && index < self.size[axis] as f64).then_some(index as usize)
+    }
+}
+
+/// The frame of reference of a grid.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Axes {
+    /// The lidar's, in which networks see.
+    #[default]
+    Lidar,
+    /// The vehicle's, in which the lidar is mounted somewhere.
+    Ego,
+}
+
+/// What is known about a frame's voxels, `[x, y, z]`, z fastest.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Truth {
+    /// Class of each voxel, 0 is empty; [`IGNORED`] counts nowhere.
+    pub labels: Vec<u8>,
+    /// For each of [`DataSet::masks`], 1 for the voxels that belong to it, else 0.
+    pub masks: Vec<Vec<u8>>,
+    /// Where the rays of [`ray_iou`](crate::eval::ray_iou) begin, in metres of the grid.
+    pub origins: Vec<[f64; 3]>,
+    /// The frame of the grid in that of the lidar. It matters where the grid has other axes than the lidar's.
+    pub grid_to_lidar: Pose,
+}
+
+/// A frame: what a network gets, and what it should say.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Frame {
+    /// Images and calibration.
+    pub scene: Scene,
+    /// The labels.
+    pub truth: Truth,
+}
+
+/// Frames with labels.
+pub trait DataSet: Send + Sync {
+    /// Names of the classes, in order; 0 is empty.
+    fn classes(&self) -> &[&'static str];
+
+    /// Where the labelled voxels lie.
+    fn grid(&self) -> Grid;
+
+    /// Names of the masks that every frame has: parts of the grid to be scored by themselves.
+    fn masks(&self) -> &[&'static str];
+
+    /// Number of frames.
+    fn len(&self) -> usize;
+
+    /// Whether there are none.
+    fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// What the data set calls frame `index`; unique in the set.
+    ///
+    /// # Panics
+    /// If there is no such frame.
+    fn id(&self, index: usize) -> &str;
+
+    /// Reads frame `index`.
+    ///
+    /// # Errors
+    /// Names the file that is missing or malformed.
+    ///
+    /// # Panics
+    /// If there is no such frame.
+    fn frame(&self, index: usize) -> Result<Frame>;
+
+    /// Reads the labels of frame `index` alone.
+    ///
+    /// # Errors
+    /// As [`DataSet::frame`].
+    ///
+    /// # Panics
+    /// If there is no such frame.
+    fn truth(&self, index: usize) -> Result<Truth>;
+}
+
+/// Refuses labels that are neither a class nor [`IGNORED`].
+fn check_labels(labels: &[u8], classes: usize) -> Result<()> {
+    match labels.iter().position(|&label| usize::from(label) >= classes && label != IGNORED) {
+        None => Ok(()),
+        Some(at) => {
+            let found = labels[at];
+            Err(Error::format(format!("voxel {at} has label {found}, expected 0 to {} or {IGNORED}", classes - 1)))
+        }
+    }
+}
+
+/// Whether `text` names a file below the directory that it is joined to, so that a table that came from elsewhere cannot
+/// make the program read what lies elsewhere.
+fn is_inside(text: &str) -> bool {
+    let normal = Path::new(text).components().all(|c| matches!(c, Component::Normal(_)));
+    normal && !text.is_empty() && !text.contains(['\\', '\0'])
+}

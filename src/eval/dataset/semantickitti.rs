@@ -1,0 +1,298 @@
+//! SemanticKITTI's scene completion as it is published (arXiv 1904.01416): sequences of the KITTI odometry benchmark, and
+//! labelled voxels of every fifth frame.
+//!
+//! Below `ROOT/sequences/NN`, `calib.txt`, `image_2/*.png` (and `image_3`) and `voxels/*.{label,invalid}` are read. What one
+//! sweep alone occupies (`.bin`) and what is `.occluded` from every place are no part of the score, and not read.
+
+use super::{Axes, DataSet, Frame, Grid, IGNORED, Pose, Truth};
+use crate::base::error::{Error, Result};
+use crate::scene::{Scene, check_finite, read_image};
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+/// Names of the classes, in order; 0 is empty.
+pub const CLASSES: [&str; 20] = [
+    "empty",
+    "car",
+    "bicycle",
+    "motorcycle",
+    "truck",
+    "other vehicle",
+    "person",
+    "bicyclist",
+    "motorcyclist",
+    "road",
+    "parking",
+    "sidewalk",
+    "other ground",
+    "building",
+    "fence",
+    "vegetation",
+    "trunk",
+    "terrain",
+    "pole",
+    "traffic sign",
+];
+
+const GRID: Grid = Grid { size: [256, 256, 32], bounds: [[0.0, 51.2], [-25.6, 25.6], [-2.0, 4.4]], axes: Axes::Lidar };
+
+/// The class of a label as it is stored, of the official map; [`IGNORED`] for those that it counts nowhere, none for what is
+/// no label. Moving objects are of the class of those that stand.
+fn class_of(label: u16) -> Option<u8> {
+    Some(match label {
+        0 => 0,
+        10 | 252 => 1,
+        11 => 2,
+        15 => 3,
+        18 | 258 => 4,
+        13 | 16 | 20 | 256 | 257 | 259 => 5,
+        30 | 254 => 6,
+        31 | 253 => 7,
+        32 | 255 => 8,
+        40 | 60 => 9,
+        44 => 10,
+        48 => 11,
+        49 => 12,
+        50 => 13,
+        51 => 14,
+        70 => 15,
+        71 => 16,
+        72 => 17,
+        80 => 18,
+        81 => 19,
+        // Outlier, other structure, other object.
+        1 | 52 | 99 => IGNORED,
+        _ => return None,
+    })
+}
+
+/// Which sequences.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Split {
+    /// 00 to 07, 09 and 10.
+    Train,
+    /// 08.
+    Val,
+    /// 11 to 21, whose labels are not published.
+    Test,
+    /// One sequence, 0 to 21.
+    Sequence(u8),
+}
+
+impl Split {
+    fn sequences(self) -> Vec<u8> {
+        match self {
+            Split::Train => vec![0, 1, 2, 3, 4, 5, 6, 7, 9, 10],
+            Split::Val => vec![8],
+            Split::Test => (11..=21).collect(),
+            Split::Sequence(number) => vec![number],
+        }
+    }
+}
+
+impl FromStr for Split {
+    type Err = String;
+
+    /// `train`, `val`, `test`, or the two digits of a sequence.
+    fn from_str(text: &str) -> std::result::Result<Self, String> {
+        match text {
+            "train" => Ok(Split::Train),
+            "val" => Ok(Split::Val),
+            "test" => Ok(Split::Test),
+            _ => match text.parse() {
+                Ok(number @ 0..=21) if text.len() == 2 && !text.starts_with('+') => Ok(Split::Sequence(number)),
+                _ => Err(format!("{text:?}, expected train, val, test or a sequence 00 to 21")),
+            },
+        }
+    }
+}
+
+/// SemanticKITTI: the frames with labels, in the order of sequence and number, without masks.
+#[derive(Clone, Debug)]
+pub struct SemanticKitti {
+    sequences: Vec<Sequence>,
+    frames: Vec<Numbered>,
+}
+
+/// A drive, with one calibration.
+#[derive(Clone, Debug)]
+struct Sequence {
+    directory: PathBuf,
+    cameras: Vec<Camera>,
+}
+
+#[derive(Clone, Debug)]
+struct Camera {
+    /// Its folder of images.
+    name: &'static str,
+    lidar2img: [f32; 16],
+}
+
+#[derive(Clone, Debug)]
+struct Numbered {
+    /// Index in `sequences`.
+    sequence: usize,
+    /// `NN/NNNNNN`.
+    id: String,
+}
+
+impl Numbered {
+    /// File name without its ending.
+    fn stem(&self) -> &str {
+        &self.id[3..]
+    }
+}
+
+impl SemanticKitti {
+    /// Opens the sequences of `split` below `root/sequences`. The camera is the left colour one (`image_2`), with `stereo`
+    /// followed by the right one (`image_3`). Frames are listed, not read.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Io`](crate::ErrorKind::Io) if a sequence of the split or its calibration cannot be read;
+    /// [`ErrorKind::Format`](crate::ErrorKind::Format) if the calibration is malformed or a sequence has no labels.
+    pub fn open(root: &Path, split: Split, stereo: bool) -> Result<Self> {
+        let names: &[(&str, &str)] =
+            if stereo { &[("image_2", "P2"), ("image_3", "P3")] } else { &[("image_2", "P2")] };
+        let mut set = Self { sequences: Vec::new(), frames: Vec::new() };
+        for number in split.sequences() {
+            let directory = root.join("sequences").join(format!("{number:02}"));
+            let path = directory.join("calib.txt");
+            let text = std::fs::read_to_string(&path).map_err(|e| Error::io(&path, "read", &e))?;
+            let cameras = names.iter().map(|&(name, key)| {
+                let lidar2img = product(&rows(&text, key)?, &rows(&text, "Tr")?);
+                check_finite(name, &lidar2img)?;
+                Ok(Camera { name, lidar2img })
+            });
+            let cameras = cameras.collect::<Result<_>>().map_err(|e| e.in_file(&path))?;
+            let sequence = set.sequences.len();
+            let stems = labelled(&directory.join("voxels"))?;
+            set.frames.extend(stems.into_iter().map(|s| Numbered { sequence, id: format!("{number:02}/{s}") }));
+            set.sequences.push(Sequence { directory, cameras });
+        }
+        Ok(set)
+    }
+}
+
+/// The numbers of the frames in `directory` that have a `.label`, ascending.
+fn labelled(directory: &Path) -> Result<Vec<String>> {
+    let failed = |e: &std::io::Error| Error::io(directory, "read", e);
+    let mut stems = Vec::new();
+    for entry in std::fs::read_dir(directory).map_err(|e| failed(&e))? {
+        let name = entry.map_err(|e| failed(&e))?.file_name();
+        let stem = name.to_str().and_then(|n| n.strip_suffix(".label"));
+        stems.extend(stem.filter(|s| !s.is_empty() && s.bytes().all(|b| b.is_ascii_digit())).map(str::to_owned));
+    }
+    if stems.is_empty() {
+        return Err(Error::format("no labels, expected files such as 000005.label").in_file(directory));
+    }
+    stems.sort_unstable();
+    Ok(stems)
+}
+
+/// The 3x4 matrix of the line `key: ...` of a `calib.txt`.
+fn rows(text: &str, key: &str) -> Result<[[f64; 4]; 3]> {
+    let line = text.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix(':'));
+    let line = line.ok_or_else(|| Error::format(format!("no line \"{key}:\", expected one of 12 numbers")))?;
+    let mut numbers = [0.0; 12];
+    let mut found = 0;
+    for word in line.split_whitespace() {
+        let number = word.parse::<f64>().ok().filter(|n| n.is_finite());
+        let number = number.ok_or_else(|| Error::format(format!("{key}: {word:?}, expected a finite number")))?;
+        if let Some(place) = numbers.get_mut(found) {
+            *place = number;
+        }
+        found += 1;
+    }
+    if found != 12 {
+        return Err(Error::format(format!("{key}: {found} numbers, expected 12")));
+    }
+    Ok(std::array::from_fn(|row| std::array::from_fn(|column| numbers[4 * row + column])))
+}
+
+/// Row-major 4x4 of first the rigid `lidar2camera`, then `camera2img`: computed in f64, rounded once.
+fn product(camera2img: &[[f64; 4]; 3], lidar2camera: &[[f64; 4]; 3]) -> [f32; 16] {
+    let mut matrix = [0.0; 16];
+    matrix[15] = 1.0;
+    for (row, factors) in camera2img.iter().enumerate() {
+        for column in 0..4 {
+            let sum: f64 = (0..3).map(|i| factors[i] * lidar2camera[i][column]).sum();
+            matrix[4 * row + column] = (sum + if column == 3 { factors[3] } else { 0.0 }) as f32;
+        }
+    }
+    matrix
+}
+
+/// The bytes of a file that has `expected` of them.
+fn read_exactly(path: &Path, expected: usize) -> Result<Vec<u8>> {
+    let file = File::open(path).map_err(|e| Error::io(path, "open", &e))?;
+    let length = file.metadata().map_err(|e| Error::io(path, "read", &e))?.len();
+    if length != expected as u64 {
+        return Err(Error::format(format!("{length} bytes, expected {expected}")).in_file(path));
+    }
+    let mut bytes = Vec::with_capacity(expected);
+    file.take(length).read_to_end(&mut bytes).map_err(|e| Error::io(path, "read", &e))?;
+    if bytes.len() != expected {
+        return Err(Error::format(format!("{} bytes, expected {expected}", bytes.len())).in_file(path));
+    }
+    Ok(bytes)
+}
+
+impl DataSet for SemanticKitti {
+    fn classes(&self) -> &[&'static str] {
+        &CLASSES
+    }
+
+    fn grid(&self) -> Grid {
+        GRID
+    }
+
+    fn masks(&self) -> &[&'static str] {
+        &[]
+    }
+
+    fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    fn id(&self, index: usize) -> &str {
+        &self.frames[index].id
+    }
+
+    fn frame(&self, index: usize) -> Result<Frame> {
+        let frame = &self.frames[index];
+        let sequence = &self.sequences[frame.sequence];
+        let mut scene = Scene { names: Vec::new(), images: Vec::new(), lidar2img: Vec::new() };
+        for camera in &sequence.cameras {
+            let path = sequence.directory.join(camera.name).join(format!("{}.png", frame.stem()));
+            scene.images.push(read_image(&path, camera.name, None)?);
+            scene.names.push(camera.name.to_owned());
+            scene.lidar2img.push(camera.lidar2img);
+        }
+        Ok(Frame { scene, truth: self.truth(index)? })
+    }
+
+    fn truth(&self, index: usize) -> Result<Truth> {
+        let frame = &self.frames[index];
+        let voxels = self.sequences[frame.sequence].directory.join("voxels");
+        let path = voxels.join(format!("{}.label", frame.stem()));
+        let stored = read_exactly(&path, 2 * GRID.voxels())?;
+        // One bit per voxel, the first in the highest.
+        let invalid = read_exactly(&voxels.join(format!("{}.invalid", frame.stem())), GRID.voxels() / 8)?;
+        let mut labels = Vec::with_capacity(GRID.voxels());
+        for (at, &bytes) in stored.as_chunks::<2>().0.iter().enumerate() {
+            let label = u16::from_le_bytes(bytes);
+            let class = class_of(label).ok_or_else(|| {
+                Error::format(format!("voxel {at} has label {label}, which SemanticKITTI does not have")).in_file(&path)
+            })?;
+            let known = invalid[at / 8] >> (7 - at % 8) & 1 == 0;
+            labels.push(if known { class } else { IGNORED });
+        }
+        // The lidar is where the frame's metres begin.
+        Ok(Truth { labels, masks: vec![], origins: vec![[0.0; 3]], grid_to_lidar: Pose::IDENTITY })
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,193 @@
+//! The `.pth` reader: entries of the archive, the pickle's state dict, and where its tensors lie.
+
+use super::Contents;
+use super::archive::Archive;
+use super::pickle::{Id, Pickle, TensorRef, Value};
+use super::tensor::{MAX_DIMS, Tensor};
+use crate::base::error::{Error, ErrorKind, Result};
+use std::collections::{BTreeMap, HashMap};
+
+/// Newest archive version; `torch.save` writes 3, and nothing yet more than this.
+const MAX_VERSION: u32 = 10;
+
+/// Lists the tensors of the archive that fills `file`.
+pub(super) fn read(file: &[u8]) -> Result<Contents> {
+    let mut archive = Archive::open(file)?;
+    let folder = folder(&archive)?;
+    check_kind(&mut archive, &folder)?;
+    let entry = format!("{folder}data.pkl");
+    let bytes = archive.bytes(&entry)?.ok_or_else(|| Error::format(format!("no zip entry {entry:?}")))?;
+    let pickle = Pickle::parse(&bytes)?;
+    let dict = state_dict(&pickle)?;
+
+    let mut reader = Reader {
+        pickle: &pickle,
+        archive,
+        folder,
+        contents: Contents { storages: Vec::new(), tensors: Vec::new(), names: BTreeMap::new() },
+        keys: HashMap::new(),
+        ids: HashMap::new(),
+    };
+    for &(key, value) in dict {
+        if let (&Value::Str(name), Value::Tensor(tensor)) = (pickle.get(key), pickle.get(value)) {
+            let name = std::str::from_utf8(pickle.text(name))
+                .map_err(|_| Error::format("the state dict has a name that is not UTF-8"))?;
+            reader.add(name, value, tensor)?;
+        }
+    }
+    let contents = reader.contents;
+    if contents.names.is_empty() {
+        return Err(Error::format(format!("the state dict holds no tensors; {}", keys(&pickle, dict))));
+    }
+    Ok(contents)
+}
+
+/// The one top folder with its slash; `torch.save` names it after the file.
+fn folder(archive: &Archive<'_>) -> Result<String> {
+    let mut pickles = archive.names().filter_map(|name| name.strip_suffix("data.pkl"));
+    let mut top = pickles.by_ref().filter(|folder| folder.matches('/').count() == 1 && folder.ends_with('/'));
+    match (top.next(), top.next()) {
+        (Some(folder), None) => Ok(folder.to_owned()),
+        (None, _) => Err(Error::format("a zip without a folder that holds data.pkl, so not from torch.save")),
+        (Some(a), Some(b)) => Err(Error::format(format!("two pickles, in {a:?} and in {b:?}, expected one"))),
+    }
+}
+
+/// Refuses what only looks like the output of `torch.save`, or is of a kind that is not read.
+fn check_kind(archive: &mut Archive<'_>, folder: &str) -> Result<()> {
+    let unsupported = |what: String| Err(Error::new(ErrorKind::Unsupported, what));
+    let script = [format!("{folder}constants.pkl"), format!("{folder}code/")];
+    if archive.names().any(|name| name == script[0] || name.starts_with(&script[1])) {
+        return unsupported("a TorchScript archive; save the model's state_dict with torch.save".into());
+    }
+    if let Some(order) = archive.bytes(&format!("{folder}byteorder"))?
+        && *order != *b"little"
+    {
+        let order = String::from_utf8_lossy(&order[..order.len().min(20)]).into_owned();
+        return unsupported(format!("byteorder is {order:?}, expected \"little\"; re-save on a little-endian machine"));
+    }
+    if let Some(version) = archive.bytes(&format!("{folder}version"))? {
+        let text = String::from_utf8_lossy(&version[..version.len().min(20)]).into_owned();
+        if !text.trim_end().parse::<u32>().is_ok_and(|v| (1..=MAX_VERSION).contains(&v)) {
+            return unsupported(format!("archive version {text:?}, expected 1 to {MAX_VERSION}"));
+        }
+    }
+    Ok(())
+}
+
+/// The dict of tensors: under `state_dict` at the top, or the top itself.
+fn state_dict<'p>(pickle: &'p Pickle<'_>) -> Result<&'p [(Id, Id)]> {
+    let Value::Dict(top) = pickle.root() else {
+        return Err(Error::format(format!("the checkpoint is {}, expected a dict", pickle.root().kind())));
+    };
+    let is_state_dict = |id| matches!(pickle.get(id), Value::Str(t) if pickle.text(*t) == b"state_dict");
+    // As in Python, the last of equal keys counts.
+    match top.iter().rev().find(|(key, _)| is_state_dict(*key)).map(|&(_, value)| pickle.get(value)) {
+        Some(Value::Dict(dict)) => Ok(dict),
+        Some(other) => Err(Error::format(format!("state_dict is {}, expected a dict", other.kind()))),
+        None if top.iter().any(|&(_, value)| matches!(pickle.get(value), Value::Tensor(_))) => Ok(top),
+        None => {
+            let found = keys(pickle, top);
+            Err(Error::format(format!("no state_dict; {found}, expected state_dict or tensors by name")))
+        }
+    }
+}
+
+/// The first few keys of a dict, for a message.
+fn keys(pickle: &Pickle<'_>, dict: &[(Id, Id)]) -> String {
+    let names = dict.iter().filter_map(|&(key, _)| match pickle.get(key) {
+        Value::Str(text) => {
+            let bytes = pickle.text(*text);
+            Some(format!("{:?}", String::from_utf8_lossy(&bytes[..bytes.len().min(40)])))
+        }
+        _ => None,
+    });
+    let names: Vec<_> = names.take(6).collect();
+    if names.is_empty() { "it has no named keys".into() } else { format!("its keys begin with {}", names.join(", ")) }
+}
+
+struct Reader<'p, 'a> {
+    pickle: &'p Pickle<'p>,
+    archive: Archive<'a>,
+    folder: String,
+    contents: Contents,
+    /// Storages by the name of their entry.
+    keys: HashMap<&'p [u8], usize>,
+    /// Tensors by their value, for one may have several names.
+    ids: HashMap<Id, usize>,
+}
+
+impl<'p> Reader<'p, '_> {
+    fn add(&mut self, name: &str, id: Id, tensor: &TensorRef) -> Result<()> {
+        let index = match self.ids.get(&id) {
+            Some(&index) => index,
+            None => {
+                let wrong = |e: Error| Error::new(e.kind(), format!("tensor {name:?}: {}", e.message()));
+                let tensor = self.tensor(tensor).map_err(wrong)?;
+                self.contents.tensors.push(tensor);
+                self.ids.insert(id, self.contents.tensors.len() - 1);
+                self.contents.tensors.len() - 1
+            }
+        };
+        match self.contents.names.insert(name.to_owned(), index) {
+            Some(_) => Err(Error::format(format!("two tensors are called {name:?}"))),
+            None => Ok(()),
+        }
+    }
+
+    /// The tensor, with its storage found and its bounds checked.
+    fn tensor(&mut self, tensor: &TensorRef) -> Result<Tensor> {
+        let (shape, stride) = (self.sizes(tensor.size)?, self.sizes(tensor.stride)?);
+        if shape.len() != stride.len() {
+            return Err(Error::format(format!("shape {shape:?} and strides {stride:?} have different lengths")));
+        }
+        let Ok(offset) = usize::try_from(tensor.offset) else {
+            return Err(Error::format(format!("offset {}, expected 0 or more", tensor.offset)));
+        };
+        let storage = self.storage(tensor.storage)?;
+        let stored = self.contents.storages[storage].len() / usize::from(tensor.element.size.max(1));
+        let tensor = Tensor { element: tensor.element, shape, stride, offset, storage };
+        tensor.check(stored).map_err(Error::format)?;
+        Ok(tensor)
+    }
+
+    fn sizes(&self, id: Id) -> Result<Box<[usize]>> {
+        let sizes = self.pickle.sequence(id).unwrap_or_default();
+        if sizes.len() > MAX_DIMS {
+            return Err(Error::format(format!("{} dimensions, expected at most {MAX_DIMS}", sizes.len())));
+        }
+        let size = |&id: &Id| match self.pickle.get(id) {
+            Value::Int(n) => usize::try_from(*n).map_err(|_| format!("a size or stride of {n}, expected 0 or more")),
+            other => Err(format!("a size or stride that is {}, expected an int", other.kind())),
+        };
+        sizes.iter().map(size).collect::<std::result::Result<_, _>>().map_err(Error::format)
+    }
+
+    /// Index of the storage, which has exactly the declared length.
+    fn storage(&mut self, id: Id) -> Result<usize> {
+        let Value::Storage(storage) = self.pickle.get(id) else {
+            return Err(Error::format(format!("its storage is {}", self.pickle.get(id).kind())));
+        };
+        let key = self.pickle.text(storage.key);
+        let index = match self.keys.get(key) {
+            Some(&index) => index,
+            None => {
+                let shown = String::from_utf8_lossy(&key[..key.len().min(40)]);
+                let missing = || Error::format(format!("no zip entry \"{}data/{shown}\" for its storage", self.folder));
+                let name = std::str::from_utf8(key).map_err(|_| missing())?;
+                let found = self.archive.entry(&format!("{}data/{name}", self.folder))?.ok_or_else(missing)?;
+                self.contents.storages.push(found);
+                self.keys.insert(key, self.contents.storages.len() - 1);
+                self.contents.storages.len() - 1
+            }
+        };
+        let found = self.contents.storages[index].len();
+        let (numel, size) = (storage.numel, storage.element.size);
+        if numel.checked_mul(u64::from(size)) != Some(found as u64) {
+            return Err(Error::format(format!(
+                "its storage has {found} bytes, declared are {numel} elements of {size}"
+            )));
+        }
+        Ok(index)
+    }
+}

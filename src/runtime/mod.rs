@@ -1,0 +1,7 @@
+//! Running a model: the plan of its memory, the arena, the executor of operations, and the session that callers hold.
+
+pub(crate) mod arena;
+pub(crate) mod executor;
+pub(crate) mod heap;
+pub mod plan;
+pub mod session;

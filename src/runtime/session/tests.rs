@@ -1,0 +1,130 @@
+//! What a session refuses, and what it says of itself.
+
+use super::*;
+use crate::graph::Op;
+use crate::model::Options;
+use crate::model::import::import;
+use crate::model::seeded::SeededWeights;
+use crate::rig::RigBuilder;
+
+fn network() -> Network {
+    Network {
+        depths: [1; 4],
+        width: 2,
+        fpn: 4,
+        channels: [3, 8, 8, 8],
+        key_dims: [1; 3],
+        classes: 4,
+        image: [32, 64],
+        grids: [[8, 4, 4], [4, 2, 2], [2, 1, 1]],
+        samples: [1; 3],
+        cameras: 2,
+        ..Network::built_in("nuscenes-200").expect("built in")
+    }
+}
+
+fn model() -> Arc<Model> {
+    let directory = tempfile::tempdir().expect("a place");
+    let path = directory.path().join("model");
+    import(&SeededWeights { seed: 1 }, &network(), Options::default(), &path, &mut |_, _| ()).expect("a model");
+    Arc::new(Model::open(&path).expect("a sound model"))
+}
+
+/// Looks ahead along x.
+const AHEAD: [f32; 16] = [32., -40., 0., 0., 16., 0., -40., 0., 1., 0., 0., 0., 0., 0., 0., 1.];
+
+fn rig(network: &Network, cameras: usize) -> Arc<Rig> {
+    let built = RigBuilder::new(network, cameras, Isa::best()).and_then(|mut b| b.build(&vec![AHEAD; cameras]));
+    Arc::new(built.expect("a rig"))
+}
+
+fn session() -> Session {
+    Session::new(model(), rig(&network(), 2), &SessionOptions::default()).expect("a session")
+}
+
+#[test]
+fn images_that_do_not_fit_are_refused() {
+    let mut session = session();
+    let bytes = vec![9u8; 32 * 64 * 3];
+    let view = |height: usize, width, len| ImageView::bgr(height, width, &bytes[..len]);
+    let sound = view(32, 64, 6144);
+    for (images, expected) in [
+        (vec![], "0 images, the rig has 2 cameras"),
+        (vec![sound], "1 images"),
+        (vec![sound; 3], "3 images"),
+        (vec![sound, view(64, 32, 6144)], "image 1: 64x32 (height x width), the network expects"),
+        (vec![view(32, 64, 6143), sound], "image 0: 6143 bytes"),
+        (vec![view(33, 60, 33 * 60 * 3), sound], "pads to 32x64"),
+        (vec![view(0, 64, 0), sound], "image 0"),
+        (vec![ImageView { height: usize::MAX, ..sound }, sound], "image 0: 18446744073709551615x64"),
+        (vec![view(1 << 63, 64, 0), sound], "image 0"),
+    ] {
+        let error = session.run(&images).expect_err(expected);
+        assert_eq!(error.kind(), ErrorKind::Mismatch);
+        assert!(error.message().contains(expected), "{error}");
+    }
+    let classes = session.run(&[sound; 2]).expect("sound images").classes.to_vec();
+    assert_eq!(classes.len(), 16 * 8 * 8);
+    // The smallest size that pads to the network's.
+    assert!(session.run(&[view(1, 33, 99); 2]).is_ok());
+}
+
+#[test]
+fn scenes_that_do_not_fit_are_refused() {
+    let mut session = session();
+    let scene = crate::demo::demo_scene(&network(), 1);
+    assert_eq!(session.run_scene(&scene).expect("a scene of this network").grid, [16, 8, 8]);
+    let other = crate::demo::demo_scene(&Network { image: [32, 32], ..network() }, 1);
+    assert!(session.run_scene(&other).expect_err("another size").message().contains("32x32"));
+    let fewer = crate::demo::demo_scene(&Network { cameras: 1, ..network() }, 1);
+    assert!(session.run_scene(&fewer).expect_err("another number").message().contains("1 images"));
+}
+
+#[test]
+fn rigs_of_other_networks_are_refused() {
+    let mut session = session();
+    let wider = Network { grids: [[16, 4, 4], [8, 2, 2], [4, 1, 1]], ..network() };
+    let finer = Network { image: [64, 128], ..network() };
+    for (rig, expected) in [
+        (rig(&network(), 3), "the rig has 3 cameras, expected 2"),
+        (rig(&wider, 2), "level 1: the rig's volume matrix has 256 rows, the network expects 128"),
+        (rig(&finer, 2), "level 1: the rig's volume matrix names pixel"),
+    ] {
+        let error = session.set_rig(rig).expect_err(expected);
+        assert_eq!(error.kind(), ErrorKind::Mismatch);
+        assert!(error.message().contains(expected), "{error}");
+    }
+    session.set_rig(rig(&network(), 2)).expect("its own");
+    let error = Session::new(model(), rig(&wider, 2), &SessionOptions::default()).expect_err("another network");
+    assert_eq!(error.kind(), ErrorKind::Mismatch);
+}
+
+#[test]
+fn memory_that_cannot_be_addressed_is_refused() {
+    let model = model();
+    let error = Session::memory(&model, usize::MAX / 2, &SessionOptions::default()).expect_err("too many cameras");
+    assert_eq!(error.kind(), ErrorKind::TooLarge);
+}
+
+#[test]
+fn events_come_in_running_order() {
+    let mut session = session();
+    let graph = session.graph().clone();
+    let scene = crate::demo::demo_scene(&network(), 1);
+    let mut events = vec![];
+    session
+        .run_observed(&views(&scene), &mut |e| events.push((e.operation.name.clone(), e.camera, e.output.len())))
+        .expect("a frame");
+    let passes = graph.camera_operations;
+    assert_eq!(events.len(), 2 * passes + graph.operations.len() - passes);
+    for (i, (name, camera, len)) in events.iter().enumerate() {
+        let index = if i < 2 * passes { i % passes } else { i - passes };
+        assert_eq!(*name, graph.operations[index].name);
+        assert_eq!(*camera, (i < 2 * passes).then_some(i / passes), "{name}");
+        let head = matches!(graph.operations[index].op, Op::Head { .. });
+        let expected = if head { 0 } else { graph.tensor(graph.operations[index].output).len() };
+        assert_eq!(*len, expected, "{name}");
+    }
+    assert_eq!(session.cameras(), 2);
+    assert!(format!("{session:?}").starts_with("Session"));
+}
