@@ -14,19 +14,15 @@ use voxcast_kernels::depthwise::{Depthwise, depthwise};
 use voxcast_kernels::gate::{Gate, gate};
 use voxcast_kernels::gather::{Gather, Mask, gather};
 use voxcast_kernels::head::{Head, head};
+use voxcast_kernels::matmul::{BLOCK_ROWS, Product, Residual};
 use voxcast_kernels::max_pool::{MaxPool, max_pool};
 use voxcast_kernels::normalise::normalise;
 use voxcast_kernels::pool::{Mean, broadcast, mean};
-use voxcast_kernels::product::{Product, Residual};
 use voxcast_kernels::scale_shift::{ScaleShift, scale_shift};
 use voxcast_kernels::upsample_add::{UpsampleAdd, upsample_add};
 use voxcast_kernels::window_attention::{WindowAttention, window_attention};
 use voxcast_kernels::{Isa, Panels};
 
-/// Most rows of a convolution that one worker takes at a time: one block of the product kernel.
-const CONV_ROWS: usize = 96;
-/// Rows that the product kernel computes at once.
-const CONV_TILE: usize = 6;
 /// Numbers in the image rows or volume planes that one worker computes at a time, at least.
 const LINES: usize = 1 << 14;
 /// Voxels or cells that one worker gathers at a time.
@@ -398,8 +394,8 @@ impl Executor {
         let start = self.range(operation.output, call.camera).start + operation.first_channel;
         let rows = geometry.rows();
         // As many tiles as blocks of rows, but the same number for every worker.
-        let tiles = rows.div_ceil(CONV_ROWS).next_multiple_of(self.plan.workers());
-        let per_tile = rows.div_ceil(tiles).next_multiple_of(CONV_TILE);
+        let tiles = rows.div_ceil(BLOCK_ROWS).next_multiple_of(self.plan.workers());
+        let per_tile = rows.div_ceil(tiles).next_multiple_of(self.isa.tile().rows);
         self.tiles(call.slice, rows.div_ceil(per_tile), &|worker, tile| {
             let rows = tile * per_tile..rows.min((tile + 1) * per_tile);
             let place = start + rows.start * stride..start + (rows.end - 1) * stride + operation.channels;

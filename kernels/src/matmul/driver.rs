@@ -8,28 +8,25 @@
 //! samples) only those that lie nowhere in this order. The right matrix is packed ([`crate::panels`]).
 //!
 //! What the body changes relative to the formula, none of which can change a bit:
-//! 1. Rows go in blocks of `ROWS`, k in blocks of at most `DEPTH`. Between k blocks the partial sums wait in `out`, and
+//! 1. Rows go in blocks of `BLOCK_ROWS`, k in blocks of at most `DEPTH`. Between k blocks the partial sums wait in `out`, and
 //!    the next block's chain starts from them.
-//! 2. Inside, a tile lives in registers. With AVX2 it is 6 rows by 16 columns: 12 accumulators of 8 lanes, 2 registers of
-//!    weights and broadcasts of `a`, the most that 16 registers hold without spilling. With AVX-512 it is 12 rows by 32
-//!    columns: 24 accumulators of 16 lanes, 2 registers of weights; each broadcast serves two multiply-adds, so that
-//!    loads do not limit the speed.
+//! 2. Inside, a tile lives in registers: as large a one as the instruction set holds without spilling
+//!    ([`crate::Isa::tile`]).
 //! 3. The packed panels of a tile and k block (at most 24 KiB) stay in the first-level cache while all tiles of the row
 //!    block use them; they fetch the next ones, a share each, and the outputs of the tile that follows.
 //! 4. Half-precision weights are widened once per panel, k block and row block.
 
+use super::layout::{Panels, packed_index};
 use crate::isa::Isa;
-use crate::panels::{Panels, packed_index};
-use crate::simd::{Kernel, LANES, Simd, dispatch, relu};
+#[cfg(not(feature = "std"))]
+use crate::math::Float as _;
+use crate::simd::{Kernel, LANES, Simd, TileRows, dispatch, relu};
+use core::ops::Range;
 use half::f16;
-use std::ops::Range;
 
-/// Rows of a tile in 16 registers.
-const TILE: usize = 6;
-/// Rows of a tile in 32 registers, which also has two panels.
-const WIDE_TILE: usize = 12;
-/// Rows of a block: with `DEPTH` numbers each they take under a third of a 512 KiB second-level cache.
-pub(crate) const ROWS: usize = 96;
+/// Rows of a block: with `DEPTH` values each they take under a third of a 512 KiB second-level cache. A multiple of every
+/// tile's rows, so that whole blocks are whole tiles.
+pub const BLOCK_ROWS: usize = 96;
 /// Most numbers of k per block, for all panels of a tile together: a packed panel of them takes three quarters of a 32 KiB first-level cache.
 pub(crate) const DEPTH: usize = 384;
 /// Distance between the rows of a block. The extra 16 keep rows from falling into the same cache set.
@@ -38,7 +35,7 @@ const STRIDE: usize = DEPTH + LANES;
 /// Pieces of a k block. Shorter pieces than an eighth of it are better copied together.
 pub(crate) const PIECES: usize = 8;
 /// f32 of scratch that one call needs.
-pub const SCRATCH: usize = ROWS * STRIDE + DEPTH * LANES;
+pub const SCRATCH: usize = BLOCK_ROWS * STRIDE + DEPTH * LANES;
 
 /// What is added to the sum, and when.
 #[derive(Clone, Copy, Debug)]
@@ -193,12 +190,12 @@ struct Pieces {
     len: [usize; PIECES],
     count: usize,
     /// First element of each piece of each row.
-    start: [[*const f32; ROWS]; PIECES],
+    start: [[*const f32; BLOCK_ROWS]; PIECES],
 }
 
 impl Pieces {
     fn new() -> Self {
-        Self { len: [0; PIECES], count: 0, start: [[std::ptr::null(); ROWS]; PIECES] }
+        Self { len: [0; PIECES], count: 0, start: [[core::ptr::null(); BLOCK_ROWS]; PIECES] }
     }
 
     /// Finds or makes the pieces of the k block at `k` for `rows` rows from `at` on. Returns the block's depth.
@@ -296,16 +293,16 @@ pub(crate) fn product<S: Simd, A: Source, T: Target>(
     out: &mut [f32],
     scratch: &mut [f32],
 ) {
-    let (block, widened) = scratch[..SCRATCH].split_at_mut(ROWS * STRIDE);
+    let (block, widened) = scratch[..SCRATCH].split_at_mut(BLOCK_ROWS * STRIDE);
     let panels = p.columns.div_ceil(LANES);
     // Equal k blocks, as few as possible.
-    let most = if S::WIDE && panels >= 2 { DEPTH / 2 } else { DEPTH };
+    let most = DEPTH / S::TILE.panels.min(panels.max(1));
     let step = p.depth.div_ceil(p.depth.div_ceil(most).max(1)).next_multiple_of(LANES);
     let mut pieces = Pieces::new();
-    let mut offsets = [0; ROWS];
+    let mut offsets = [0; BLOCK_ROWS];
     let mut first = rows.start;
     while first < rows.end {
-        let count = ROWS.min(rows.end - first);
+        let count = BLOCK_ROWS.min(rows.end - first);
         for (i, offset) in offsets[..count].iter_mut().enumerate() {
             *offset = target.offset(first + i);
         }
@@ -324,7 +321,7 @@ pub(crate) fn product<S: Simd, A: Source, T: Target>(
             };
             let mut panel = 0;
             while panel < panels {
-                if S::WIDE && panels - panel >= 2 {
+                if S::TILE.panels == 2 && panels - panel >= 2 {
                     block.panels::<S, T, 2>(s, target, panel, widened, out);
                     panel += 2;
                 } else {
@@ -375,9 +372,9 @@ impl Block<'_, '_> {
             };
         }
         // The panels that are needed next, as far as there are any, in equal shares per tile.
-        let most = if S::WIDE { WIDE_TILE } else { TILE };
+        let most = S::TILE.rows;
         let share = len.div_ceil(count.div_ceil(most)).next_multiple_of(LANES);
-        let mut ahead = [std::ptr::null(); P];
+        let mut ahead = [core::ptr::null(); P];
         for (j, ahead) in ahead.iter_mut().enumerate() {
             if let Panels::F32(w) = p.weights
                 && (panel + P + j) * LANES < p.columns
@@ -398,36 +395,8 @@ impl Block<'_, '_> {
                     s.prefetch(out.as_ptr().wrapping_add(offset + (panel + j) * LANES));
                 }
             }
-            let tile = Tile { block: self, panel, weights, i };
             let whole = p.columns - panel * LANES >= P * LANES;
-            macro_rules! rows {
-                ($n:expr) => {{
-                    // A mask that lets everything pass costs nothing, so AVX-512 needs no code of its own for it.
-                    if S::WIDE || !whole {
-                        tile.run::<S, T, { $n }, false>(s, target, out)
-                    } else {
-                        tile.run::<S, T, { $n }, true>(s, target, out)
-                    }
-                    $n
-                }};
-            }
-            i += if S::WIDE {
-                match count - i {
-                    WIDE_TILE.. => rows!(WIDE_TILE),
-                    6.. => rows!(6),
-                    3.. => rows!(3),
-                    _ => rows!(1),
-                }
-            } else {
-                match count - i {
-                    TILE.. => rows!(TILE),
-                    5 => rows!(5),
-                    4 => rows!(4),
-                    3 => rows!(3),
-                    2 => rows!(2),
-                    _ => rows!(1),
-                }
-            };
+            i += s.rows(count - i, Tile { block: self, target, panel, weights, whole, i, out: &mut *out });
         }
     }
 }
@@ -451,19 +420,35 @@ struct Ends {
 }
 
 /// Some rows of `P` panels.
-struct Tile<'a, 'p, const P: usize> {
+struct Tile<'a, 'p, T, const P: usize> {
     block: &'a Block<'a, 'p>,
-    /// First row in the block.
-    i: usize,
+    target: &'a T,
     panel: usize,
     weights: [&'a [f32]; P],
+    /// Whether all columns exist; else only the last panel lacks some.
+    whole: bool,
+    /// First row in the block.
+    i: usize,
+    out: &'a mut [f32],
 }
 
-impl<const P: usize> Tile<'_, '_, P> {
-    /// `WHOLE` says that all columns exist; else only the last panel lacks some.
+impl<S: Simd, T: Target, const P: usize> TileRows<S> for Tile<'_, '_, T, P> {
     #[inline(always)]
-    fn run<S: Simd, T: Target, const N: usize, const WHOLE: bool>(self, s: S, target: &T, out: &mut [f32]) {
+    fn run<const N: usize>(self, s: S) {
+        // A mask that lets everything pass costs nothing, so where there are masks whole columns need no code of their own.
+        if S::MASKED || !self.whole {
+            self.columns::<S, N, false>(s);
+        } else {
+            self.columns::<S, N, true>(s);
+        }
+    }
+}
+
+impl<T: Target, const P: usize> Tile<'_, '_, T, P> {
+    #[inline(always)]
+    fn columns<S: Simd, const N: usize, const WHOLE: bool>(self, s: S) {
         let Block { p, ends, row, offsets, pieces, .. } = *self.block;
+        let Self { target, out, .. } = self;
         let column = |j: usize| (self.panel + j) * LANES;
         let width = |j: usize| if WHOLE { LANES } else { LANES.min(p.columns - column(j)) };
         let offset = |r: usize, j: usize| offsets[self.i + r] + column(j);
@@ -489,7 +474,7 @@ impl<const P: usize> Tile<'_, '_, P> {
         let mut k = 0;
         for piece in 0..pieces.count {
             let len = pieces.len[piece];
-            let a = std::array::from_fn(|r| pieces.start[piece][self.i + r]);
+            let a = core::array::from_fn(|r| pieces.start[piece][self.i + r]);
             let weights = self.weights.map(|w| &w[k * LANES..(k + len) * LANES]);
             // SAFETY: `Pieces::find` set these pointers to pieces of `len` numbers each, in this k block, and nothing
             // has written there since.
@@ -559,6 +544,3 @@ unsafe fn multiply<S: Simd, const N: usize, const P: usize>(
     }
     sums
 }
-
-#[cfg(test)]
-mod tests;
