@@ -106,7 +106,7 @@ pub(crate) trait Simd: Copy {
     fn both(self, a: Self::M, b: Self::M) -> Self::M;
 
     /// Names the cache line of `p` to the first-level cache. Any address will do; nothing is read.
-    fn prefetch(self, p: *const f32);
+    fn prefetch<T>(self, p: *const T);
 
     /// Reads 16 lanes.
     #[inline(always)]
