@@ -160,7 +160,7 @@ mod tests {
         let elements = Elements::new(Element::F16, bytemuck::cast_slice(&half));
         assert!(matches!(elements.panels(), Panels::F16(v) if v == half));
         for element in [Element::F32, Element::F16, Element::U8, Element::I8, Element::I32] {
-            assert!(Elements::new(element, &[]).is_empty());
+            assert!(Elements::new(element, bytemuck::cast_slice(&values[..0])).is_empty());
         }
         let panics = |f: fn() -> usize| std::panic::catch_unwind(f).is_err();
         assert!(panics(|| Elements::new(Element::F32, &[0; 6]).len()));

@@ -23,7 +23,6 @@ use voxcast::model::Options;
 use voxcast::weights::Precision;
 use voxcast::{ImageView, Isa, Model, Session, SessionOptions, Threads, selftest};
 
-/// A network that is small enough for valgrind.
 /// Files for C programs, and the digest that they must find.
 struct Files {
     directory: tempfile::TempDir,
