@@ -12,10 +12,10 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
-use voxcast::demo::demo_scene;
 use voxcast::import::import;
 use voxcast::rig::RigBuilder;
 use voxcast::seeded::SeededWeights;
+use voxcast::synth::Synthesiser;
 use voxcast::{Budget, ImageView, Isa, Model, Network, Occupancy, Scene, Session, SessionOptions, Step};
 
 /// Time from one image of a camera to its next.
@@ -106,7 +106,8 @@ fn prepare() -> Result<(Session, [Scene; 2]), Failure> {
     let path = directory.path().join("model.safetensors");
     import(&SeededWeights { seed: 3 }, &network, Default::default(), &path, &mut |_, _| ())?;
     let model = Arc::new(Model::open(&path)?);
-    let scenes = [1, 2].map(|seed| demo_scene(&network, seed));
+    let synthesiser = Synthesiser::new(&network)?;
+    let scenes = [1, 2].map(|seed| synthesiser.frame(seed).scene);
     let rig = RigBuilder::new(&network, network.cameras, Isa::best())?.build(&scenes[0].lidar2img)?;
     let options = SessionOptions { slice_cost: 5_000_000, ..SessionOptions::default() };
     Ok((Session::new(model, Arc::new(rig), &options)?, scenes))

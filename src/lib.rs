@@ -107,7 +107,6 @@ pub mod base;
 #[cfg(feature = "capi")]
 mod capi;
 pub mod check;
-pub mod demo;
 #[cfg(feature = "eval")]
 pub mod eval;
 pub mod file;
@@ -128,9 +127,10 @@ pub use eval::dataset;
 pub use file::container;
 #[cfg(feature = "npz")]
 pub use file::{labels, npz};
+pub use graph::parts as weights;
 #[cfg(feature = "import")]
 pub use model::checkpoint;
-pub use model::{import, parts as weights, seeded};
+pub use model::{import, seeded};
 pub use runtime::{plan, session};
 pub use scene::camera;
 #[cfg(feature = "html")]
@@ -147,6 +147,14 @@ pub use scene::Scene;
 pub use session::{Budget, Occupancy, Session, SessionOptions, Step};
 pub use threads::Threads;
 pub use voxcast_kernels::{Isa, IsaError};
+
+#[cfg(test)]
+extern crate self as voxcast;
+
+#[cfg(test)]
+#[path = "../tests/support/small.rs"]
+#[allow(dead_code, unreachable_pub, reason = "shared with the tests in tests/, which use the rest")]
+mod small;
 
 /// The program in the README, compiled.
 #[cfg(doctest)]

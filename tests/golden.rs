@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use voxcast::checkpoint::Checkpoint;
 use voxcast::container::{self, Data, Layout, Tensor};
-use voxcast::graph::{Graph, Op, Rewrites};
+use voxcast::graph::{Graph, Results, Rewrites, Section};
 use voxcast::import::{Source, import};
 use voxcast::model::Options;
 use voxcast::rig::RigBuilder;
@@ -141,13 +141,14 @@ impl Case {
         let result = session
             .run_observed(&views(&self.scene), &mut |event| {
                 let Some(name) = &event.operation.stage else { return };
-                let tensor = graph.tensor(event.operation.output);
+                let tensor = graph.tensor(event.operation.result());
                 let (channels, rows) = (tensor.channels, tensor.rows());
                 assert_eq!(event.output.len(), channels * rows, "{name}");
-                assert_eq!(matches!(event.operation.op, Op::Head { .. }), name.starts_with("logits."));
+                assert_eq!(tensor.section == Section::Head, name.starts_with("logits."));
+                let output: &[f32] = event.output.of();
                 match stages.iter_mut().find(|s| s.name == *name) {
-                    Some(stage) => stage.values.extend(event.output),
-                    None => stages.push(Stage { name: name.clone(), channels, rows, values: event.output.to_vec() }),
+                    Some(stage) => stage.values.extend(output),
+                    None => stages.push(Stage { name: name.clone(), channels, rows, values: output.to_vec() }),
                 }
             })
             .unwrap();
@@ -243,7 +244,7 @@ fn unfolded_stages_agree() {
     for case in cases() {
         let model = case.model(Precision::F32, Rewrites::ALL);
         let found = case.run(model.clone(), true, Isa::best());
-        let graph = model.graph(true, true);
+        let graph = model.graph(true, Results::ALL);
         assert!(graph.stages().any(|s| s == "level1.gather.volume"));
         case.compare("projection kept", &graph, &found, case.tolerance(Precision::F32));
     }
@@ -254,7 +255,7 @@ fn folded_stages_agree() {
     for case in cases() {
         let model = case.model(Precision::F32, Rewrites::ALL);
         let found = case.run(model.clone(), false, Isa::best());
-        let graph = model.graph(false, true);
+        let graph = model.graph(false, Results::ALL);
         assert!(!graph.stages().any(|s| s == "level1.gather.volume") && graph.stages().any(|s| s == "level1.volume"));
         case.compare("projection folded", &graph, &found, case.tolerance(Precision::F32));
     }
@@ -265,7 +266,7 @@ fn stages_without_any_rewrite_agree() {
     for case in cases() {
         let model = case.model(Precision::F32, Rewrites::NONE);
         let found = case.run(model.clone(), false, Isa::best());
-        case.compare("no rewrites", &model.graph(false, true), &found, case.tolerance(Precision::F32));
+        case.compare("no rewrites", &model.graph(false, Results::ALL), &found, case.tolerance(Precision::F32));
     }
 }
 
@@ -275,7 +276,12 @@ fn half_precision_agrees() {
         let model = case.model(Precision::F16, Rewrites::ALL);
         for unfolded in [false, true] {
             let found = case.run(model.clone(), unfolded, Isa::best());
-            case.compare("half precision", &model.graph(unfolded, true), &found, case.tolerance(Precision::F16));
+            case.compare(
+                "half precision",
+                &model.graph(unfolded, Results::ALL),
+                &found,
+                case.tolerance(Precision::F16),
+            );
         }
     }
 }
@@ -287,7 +293,7 @@ fn every_instruction_set_agrees() {
             let model = case.model(precision, Rewrites::ALL);
             for isa in Isa::available() {
                 let found = case.run(model.clone(), false, isa);
-                case.compare(isa.name(), &model.graph(false, true), &found, case.tolerance(precision));
+                case.compare(isa.name(), &model.graph(false, Results::ALL), &found, case.tolerance(precision));
             }
         }
     }

@@ -8,9 +8,9 @@ use proptest::prelude::*;
 use small::Images;
 use std::ops::Range;
 use std::path::Path;
-use voxcast::graph::{Graph, Op, Rewrites, Scope, TensorId};
+use voxcast::graph::{Graph, Lifetime, Results, Rewrites, Scope, TensorId};
 use voxcast::network::Block;
-use voxcast::plan::Plan;
+use voxcast::plan::{Place, Plan, Region};
 use voxcast::weights::Precision;
 use voxcast::{Network, Session, SessionOptions, Threads};
 
@@ -19,7 +19,7 @@ use voxcast::{Network, Session, SessionOptions, Threads};
 fn plan_is_the_golden_one() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/plan.golden.txt");
     let network = small::network();
-    let graph = Graph::build(&network, false).rewritten(Rewrites::ALL);
+    let graph = Graph::build(&network, Results::default()).rewritten(Rewrites::ALL);
     let found = Plan::new(&graph, network.cameras, 2).unwrap().to_string();
     if std::env::var_os("VOXCAST_BLESS").is_some_and(|v| v == "1") {
         std::fs::write(&path, &found).unwrap();
@@ -48,7 +48,7 @@ fn memory_is_what_was_told() {
             let told = Session::memory(&model, network.cameras, &options).unwrap();
             let session = Session::new(model.clone(), rig.clone(), &options).unwrap();
             assert_eq!(session.taken(), told, "{options:?}");
-            assert_eq!(told.arena, session.plan().bytes());
+            assert_eq!(told.arena, session.plan().bytes(Region::Arena));
             assert_eq!(told.total(), told.arena + told.images + told.output + told.tables);
         }
     }
@@ -89,20 +89,23 @@ fn rewrites() -> impl Strategy<Value = Rewrites> {
 fn life(graph: &Graph, id: TensorId) -> Option<Range<usize>> {
     let uses = |i: &usize| {
         let operation = &graph.operations[*i];
-        let writes = operation.output == id && !matches!(operation.op, Op::Head { .. });
-        writes || operation.reads().any(|t| t == id)
+        operation.outputs.contains(&id) || operation.reads().any(|t| t == id)
     };
     let all = 0..graph.operations.len();
     let first = all.clone().find(uses)?;
     let last = all.clone().rfind(uses)?;
-    Some(if graph.tensor(id).scope == Scope::Features { all } else { first..last + 1 })
+    Some(if graph.tensor(id).lifetime == Lifetime::Camera || graph.tensor(id).scope != Scope::Inner {
+        all
+    } else {
+        first..last + 1
+    })
 }
 
 /// Whether `operation` may write its output over the tensor `id` that it reads.
 fn may_replace(graph: &Graph, index: usize, id: TensorId) -> bool {
     let operation = &graph.operations[index];
     let starts = operation.residual.is_some_and(|r| r.tensor == id && !r.after) && !operation.inputs.contains(&id);
-    operation.in_place() == Some(id) || (starts && matches!(operation.op, Op::Conv { .. } | Op::DeformConv { .. }))
+    operation.in_place() == Some(id) || (starts && operation.op.description().overwrites_residual())
 }
 
 proptest! {
@@ -116,25 +119,30 @@ proptest! {
         workers in 1usize..4,
     ) {
         network.check().unwrap();
-        let graph = Graph::build(&network, coarse).rewritten(rewrites);
+        let graph = Graph::build(&network, Results { logits: coarse, coarse_heads: coarse }).rewritten(rewrites);
         let plan = Plan::new(&graph, network.cameras, workers).unwrap();
-        let mut blocks: Vec<(Option<TensorId>, Range<usize>, Range<usize>)> = (0..workers)
-            .map(|w| (None, plan.scratch(w), 0..graph.operations.len()))
+        let mut blocks: Vec<(Option<TensorId>, Place, Range<usize>)> = (0..workers)
+            .map(|w| (None, Place { region: Region::Arena, bytes: plan.scratch(w) }, 0..graph.operations.len()))
             .collect();
         for id in (0..graph.tensors.len()).map(TensorId) {
             let Some(life) = life(&graph, id) else { continue };
             let tensor = graph.tensor(id);
-            if graph.operations.iter().any(|o| o.output == id && matches!(o.op, Op::Head { .. })) {
-                continue;
-            }
-            let copies = if tensor.scope == Scope::Features { network.cameras } else { 1 };
-            prop_assert!(plan.place(id).len() >= tensor.len() * copies, "{} is too small", tensor.name);
+            let bytes = tensor.bytes() * tensor.copies(network.cameras);
+            prop_assert!(plan.place(id).bytes.len() >= bytes, "{} is too small", tensor.name);
+            let region = match tensor.scope {
+                Scope::Input => Region::Input,
+                Scope::Inner => Region::Arena,
+                Scope::Output => Region::Output,
+            };
+            prop_assert_eq!(plan.place(id).region, region);
             blocks.push((Some(id), plan.place(id), life));
         }
         for (i, (a, a_place, a_life)) in blocks.iter().enumerate() {
-            prop_assert!(a_place.start % 16 == 0 && a_place.end <= plan.len());
+            prop_assert!(a_place.bytes.start % 64 == 0 && a_place.bytes.end <= plan.bytes(a_place.region));
             for (b, b_place, b_life) in &blocks[i + 1..] {
-                let apart = a_place.end <= b_place.start || b_place.end <= a_place.start;
+                let apart = a_place.region != b_place.region
+                    || a_place.bytes.end <= b_place.bytes.start
+                    || b_place.bytes.end <= a_place.bytes.start;
                 let shared = a_life.start.max(b_life.start)..a_life.end.min(b_life.end);
                 if apart || shared.is_empty() {
                     continue;
@@ -147,7 +155,8 @@ proptest! {
                 prop_assert!(
                     shared.len() == 1
                         && a_place == b_place
-                        && graph.operations[shared.start].output == *new
+                        && graph.operations[shared.start].output() == *new
+                        && plan.replaced(shared.start) == Some(*old)
                         && may_replace(&graph, shared.start, *old),
                     "{} and {} overlap in operations {shared:?}",
                     graph.tensor(*a).name,

@@ -7,6 +7,7 @@
 
 use libfuzzer_sys::fuzz_target;
 use std::sync::Arc;
+use voxcast::graph::Results;
 use voxcast::random::Random;
 use voxcast::rig::RigBuilder;
 use voxcast::{Isa, Model, Session, SessionOptions};
@@ -35,7 +36,7 @@ fn run(model: Model) {
     for unfolded in [false, true] {
         let options = SessionOptions { isa: Isa::best(), unfolded, logits: true, ..SessionOptions::default() };
         let Ok(memory) = Session::memory(&model, network.cameras, &options) else { return };
-        let graph = model.graph(unfolded, false);
+        let graph = model.graph(unfolded, Results { logits: true, ..Results::default() });
         let work = graph.operations.iter().map(|o| graph.multiply_adds(o)).fold(0, u64::saturating_add);
         if memory.total() > MAX_MEMORY || work.saturating_mul(network.cameras as u64) > MAX_WORK {
             return;

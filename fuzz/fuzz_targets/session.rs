@@ -8,7 +8,7 @@
 use libfuzzer_sys::fuzz_target;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
-use voxcast::graph::{Graph, Rewrites};
+use voxcast::graph::{Graph, Results, Rewrites};
 use voxcast::import::{Source, import};
 use voxcast::model::Options;
 use voxcast::network::{Block, Sampling};
@@ -105,7 +105,7 @@ fn model(input: &mut Input<'_>, network: &Network) -> Option<Arc<Model>> {
     let source =
         Weights { seed: u64::from(input.byte()), factor: [1.0, 1.0, 0.0, 1e3, 1e18, -1e30][input.extent(0, 5)] };
     for rewrites in [Rewrites::NONE, rewrites] {
-        let graph = Graph::build(network, true).rewritten(rewrites);
+        let graph = Graph::build(network, Results::ALL).rewritten(rewrites);
         if !is_small(&graph) {
             // Either answer will do.
             drop(Plan::new(&graph, network.cameras, 3));

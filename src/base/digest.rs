@@ -7,7 +7,7 @@ pub fn bytes(bytes: &[u8]) -> u64 {
     xxh3_64(bytes)
 }
 
-/// XXH3-64 (seed 0) of numbers as little-endian bytes; every NaN counts as 0x7fc00000, because its payload is not promised.
+/// XXH3-64 (seed 0) of f32 values as little-endian bytes; every NaN counts as 0x7fc00000, because its payload is not promised.
 /// Allocates nothing.
 pub fn floats(values: &[f32]) -> u64 {
     let mut hash = Xxh3::new();

@@ -1,4 +1,4 @@
-//! Who computes: the calling thread, a crew of its own, or a rayon pool. Work is cut into tiles that any worker may take.
+//! Who computes: the calling thread, workers of its own, or a rayon pool. Work is cut into tiles that any worker may take.
 //!
 //! A session's frames must not allocate. Rayon allocates now and then when a thread outside its pool hands it work, so
 //! [`Threads::new`] makes plain threads that wait for one thing only; [`Threads::pool`] shares a pool where its owner
@@ -19,7 +19,7 @@ pub struct Threads(Kind);
 #[derive(Clone)]
 enum Kind {
     Calling,
-    Crew(Arc<Crew>),
+    Own(Arc<Workers>),
     Pool(Arc<ThreadPool>),
 }
 
@@ -51,17 +51,17 @@ impl Threads {
         if count <= 1 {
             return Ok(Self::calling());
         }
-        let crew = Crew::new(count).map_err(|e| {
+        let workers = Workers::new(count).map_err(|e| {
             crate::Error::new(crate::ErrorKind::Unsupported, format!("cannot start {count} threads: {e}"))
         })?;
-        Ok(Self(Kind::Crew(Arc::new(crew))))
+        Ok(Self(Kind::Own(Arc::new(workers))))
     }
 
     /// Threads that compute.
     pub fn count(&self) -> usize {
         match &self.0 {
             Kind::Calling => 1,
-            Kind::Crew(crew) => crew.count(),
+            Kind::Own(own) => own.count(),
             Kind::Pool(pool) => pool.current_num_threads(),
         }
     }
@@ -70,10 +70,10 @@ impl Threads {
     pub fn broadcast<R: Send>(&self, f: impl Fn() -> R + Sync) -> Vec<R> {
         match &self.0 {
             Kind::Calling => vec![f()],
-            Kind::Crew(crew) => {
-                let results: Vec<Mutex<Option<R>>> = (0..crew.count()).map(|_| Mutex::new(None)).collect();
-                let turn = crew.turn.lock().unwrap_or_else(PoisonError::into_inner);
-                crew.run(turn, crew.count(), &|worker| *lock(&results[worker]) = Some(f()));
+            Kind::Own(own) => {
+                let results: Vec<Mutex<Option<R>>> = (0..own.count()).map(|_| Mutex::new(None)).collect();
+                let turn = own.turn.lock().unwrap_or_else(PoisonError::into_inner);
+                own.run(turn, own.count(), &|worker| *lock(&results[worker]) = Some(f()));
                 results.into_iter().filter_map(|r| r.into_inner().unwrap_or_else(PoisonError::into_inner)).collect()
             }
             Kind::Pool(pool) => pool.broadcast(|_| f()),
@@ -84,7 +84,7 @@ impl Threads {
     pub(crate) fn enter<R: Send>(&self, f: impl FnOnce() -> R + Send) -> R {
         match &self.0 {
             Kind::Pool(pool) => pool.install(f),
-            Kind::Calling | Kind::Crew(_) => f(),
+            Kind::Calling | Kind::Own(_) => f(),
         }
     }
 
@@ -109,9 +109,9 @@ impl Threads {
             _ if workers <= 1 => work(0),
             Kind::Calling => work(0),
             // Another session's operation is under way: waiting for it would take longer than going alone.
-            Kind::Crew(crew) => match crew.turn.try_lock() {
-                Ok(turn) => crew.run(turn, workers, &work),
-                Err(std::sync::TryLockError::Poisoned(turn)) => crew.run(turn.into_inner(), workers, &work),
+            Kind::Own(own) => match own.turn.try_lock() {
+                Ok(turn) => own.run(turn, workers, &work),
+                Err(std::sync::TryLockError::Poisoned(turn)) => own.run(turn.into_inner(), workers, &work),
                 Err(std::sync::TryLockError::WouldBlock) => work(0),
             },
             Kind::Pool(_) => fork(0, workers, &work),
@@ -139,7 +139,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 const SPINS: usize = 400;
 
 /// Threads that wait for work and do it together with the thread that brings it.
-struct Crew {
+struct Workers {
     shared: Arc<Shared>,
     /// Held by the one that brings work.
     turn: Mutex<()>,
@@ -149,7 +149,7 @@ struct Crew {
 #[derive(Default)]
 struct Shared {
     job: Mutex<Job>,
-    /// A round began, or the crew ends.
+    /// A round began, or the workers end.
     start: Condvar,
     /// Nobody is left working.
     done: Condvar,
@@ -194,24 +194,24 @@ impl Work {
     }
 }
 
-impl Crew {
+impl Workers {
     fn new(count: usize) -> std::io::Result<Self> {
         let shared = Arc::new(Shared::default());
-        // Dropping a crew ends and joins those that were started, also when a later one cannot be.
-        let mut crew = Self { shared, turn: Mutex::new(()), threads: vec![] };
+        // Dropping workers ends and joins those that were started, also when a later one cannot be.
+        let mut own = Self { shared, turn: Mutex::new(()), threads: vec![] };
         for worker in 1..count {
-            let shared = crew.shared.clone();
+            let shared = own.shared.clone();
             let builder = std::thread::Builder::new().name(format!("voxcast {worker}"));
-            crew.threads.push(builder.spawn(move || shared.serve(worker))?);
+            own.threads.push(builder.spawn(move || shared.serve(worker))?);
         }
-        Ok(crew)
+        Ok(own)
     }
 
     fn count(&self) -> usize {
         self.threads.len() + 1
     }
 
-    /// Runs `work(0)` here and `work(1)` to `work(workers - 1)` on the crew, and returns when all of them have.
+    /// Runs `work(0)` here and `work(1)` to `work(workers - 1)` on the others, and returns when all of them have.
     fn run<W: Fn(usize) + Sync>(&self, turn: MutexGuard<'_, ()>, workers: usize, work: &W) {
         let shared = &*self.shared;
         {
@@ -246,7 +246,7 @@ impl Crew {
     }
 }
 
-impl Drop for Crew {
+impl Drop for Workers {
     fn drop(&mut self) {
         lock(&self.shared.job).end = true;
         self.shared.start.notify_all();
@@ -281,7 +281,7 @@ impl Shared {
             }
             let Some(Work { closure, call }) = job.work else { continue };
             drop(job);
-            // SAFETY: this thread is one of those that the round's `left` counts, and `Crew::run`, which borrows the
+            // SAFETY: this thread is one of those that the round's `left` counts, and `Workers::run`, which borrows the
             // closure that the work was made of, does not end before `left` is 0.
             let result = catch_unwind(AssertUnwindSafe(|| unsafe { call(closure, worker) }));
             let mut job = lock(&self.job);

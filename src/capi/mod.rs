@@ -20,6 +20,7 @@ mod session;
 mod status;
 #[cfg(test)]
 mod tests;
+mod text;
 mod types;
 
 use std::ffi::{CStr, c_char};

@@ -1,8 +1,9 @@
 //! What a session found out, copied to where the caller wants it.
 
-use super::pointers::{Room, Text};
+use super::pointers::Room;
 use super::session::SessionHandle;
 use super::status::{Failure, Outcome, call, given, own};
+use super::text::Text;
 use super::types::{Camera, Status};
 use crate::runtime::session::{CameraStatus, Occupancy, Session};
 use std::ffi::c_char;
@@ -76,13 +77,13 @@ unsafe extern "C" fn voxcast_session_logits(
     message: *mut c_char,
     capacity: usize,
 ) -> i32 {
-    let numbers = |session: &Session| {
-        let numbers = voxels(session) * session.model().network().classes;
-        session.keeps_logits().then_some(numbers).ok_or_else(no_logits)
+    let elements = |session: &Session| {
+        let elements = voxels(session) * session.model().network().classes;
+        session.keeps_logits().then_some(elements).ok_or_else(no_logits)
     };
     let write = |o: Occupancy<'_>, out: &mut [MaybeUninit<f32>]| put(out, o.logits.unwrap_or_default().iter().copied());
     // SAFETY: `logits` and `message` are null or have room, as the header asks of the caller.
-    unsafe { copy(session, Room::new(logits, room, length), numbers, write, (message, capacity)) }
+    unsafe { copy(session, Room::new(logits, room, length), elements, write, (message, capacity)) }
 }
 
 /// # Safety

@@ -1,6 +1,6 @@
 //! From what happens in the library to what a C function returns: a status, and a line of text.
 
-use super::pointers::Text;
+use super::text::Text;
 use super::types::Status;
 use crate::base::error::{Error, ErrorKind};
 use std::any::Any;

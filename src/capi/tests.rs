@@ -1,39 +1,24 @@
 //! What a C program cannot bring about: panics, and another call inside of a handle at a known moment. The rest is in
 //! `tests/capi`.
 
-use super::pointers::Text;
 use super::session::{SessionHandle, voxcast_session_free, voxcast_session_step};
 use super::status::{Outcome, call, make, own};
+use super::text::Text;
 use super::types::{STEPS, Status};
-use crate::model::import::import;
-use crate::model::seeded::SeededWeights;
-use crate::model::{Model, Options};
+use crate::graph::Rewrites;
+use crate::graph::parts::Precision;
 use crate::network::Network;
 use crate::rig::RigBuilder;
 use crate::runtime::session::{Session, SessionOptions};
+use crate::small;
 use std::ffi::{CStr, c_char};
 use std::mem::MaybeUninit;
 use std::sync::{Arc, Mutex};
 use voxcast_kernels::Isa;
 
 fn session() -> Session {
-    let network = Network {
-        depths: [1; 4],
-        width: 2,
-        fpn: 4,
-        channels: [3, 8, 8, 8],
-        key_dims: [1; 3],
-        classes: 4,
-        image: [32, 64],
-        grids: [[8, 4, 4], [4, 2, 2], [2, 1, 1]],
-        samples: [1; 3],
-        cameras: 1,
-        ..Network::built_in("nuscenes-200").expect("built in")
-    };
-    let directory = tempfile::tempdir().expect("a place");
-    let path = directory.path().join("model");
-    import(&SeededWeights { seed: 1 }, &network, Options::default(), &path, &mut |_, _| ()).expect("a model");
-    let model = Arc::new(Model::open(&path).expect("a sound model"));
+    let network = Network { cameras: 1, ..small::tiny() };
+    let model = small::model(&network, Precision::F32, Rewrites::ALL, 1);
     let rig = RigBuilder::new(&network, 1, Isa::best()).and_then(|mut b| b.build(&[[0.0; 16]])).expect("a rig");
     Session::new(model, Arc::new(rig), &SessionOptions::default()).expect("a session")
 }

@@ -5,7 +5,7 @@
 
 use crate::base::error::{Error, Result};
 use crate::file::container::Container;
-use crate::graph::Graph;
+use crate::graph::{Graph, Results};
 use crate::network::Network;
 use safetensors::Dtype;
 use std::borrow::Cow;
@@ -14,10 +14,10 @@ use std::path::Path;
 
 /// Named tensors in a file.
 pub struct Dump {
-    source: Source,
+    contents: Contents,
 }
 
-enum Source {
+enum Contents {
     Tensors(Container),
     #[cfg(feature = "npz")]
     Arrays(Vec<crate::file::npz::OwnedArray>),
@@ -40,17 +40,17 @@ impl Dump {
         let path = if path.is_dir() { &within } else { path };
         #[cfg(feature = "npz")]
         if path.extension().is_some_and(|e| e == "npz") {
-            return Ok(Self { source: Source::Arrays(crate::file::npz::read_npz(path)?) });
+            return Ok(Self { contents: Contents::Arrays(crate::file::npz::read_npz(path)?) });
         }
-        Ok(Self { source: Source::Tensors(Container::open(path)?) })
+        Ok(Self { contents: Contents::Tensors(Container::open(path)?) })
     }
 
     /// Names of the stages, in the order in which a network runs them; others follow by name.
     pub fn names(&self) -> Vec<String> {
-        let mut names: Vec<String> = match &self.source {
-            Source::Tensors(container) => container.names(),
+        let mut names: Vec<String> = match &self.contents {
+            Contents::Tensors(container) => container.names(),
             #[cfg(feature = "npz")]
-            Source::Arrays(arrays) => arrays.iter().map(|a| a.name.clone()).collect(),
+            Contents::Arrays(arrays) => arrays.iter().map(|a| a.name.clone()).collect(),
         };
         let order = order();
         names.sort_by_key(|name| (order.iter().position(|o| o == name).unwrap_or(order.len()), name.clone()));
@@ -58,8 +58,8 @@ impl Dump {
     }
 
     fn get(&self, name: &str) -> Option<(Vec<usize>, Result<Values<'_>>)> {
-        match &self.source {
-            Source::Tensors(container) => {
+        match &self.contents {
+            Contents::Tensors(container) => {
                 let (dtype, shape, bytes) = container.tensor(name)?;
                 let bytes = Cow::Borrowed(bytes);
                 let values = match dtype {
@@ -73,7 +73,7 @@ impl Dump {
                 Some((shape.to_vec(), values))
             }
             #[cfg(feature = "npz")]
-            Source::Arrays(arrays) => {
+            Contents::Arrays(arrays) => {
                 use crate::file::npz::OwnedElements;
                 let array = arrays.iter().find(|a| a.name == name)?;
                 let values = match &array.elements {
@@ -90,7 +90,7 @@ impl Dump {
 /// Stages in running order. Their names are those of every network.
 fn order() -> Vec<String> {
     let network = Network::built_in("nuscenes-200").unwrap_or_else(|| unreachable!("a built-in name"));
-    let mut order: Vec<String> = Graph::build(&network, true).stages().map(str::to_owned).collect();
+    let mut order: Vec<String> = Graph::build(&network, Results::ALL).stages().map(str::to_owned).collect();
     let first = order.iter().position(|s| s.starts_with("level")).unwrap_or(order.len());
     let matrix = |l: usize, kind: &str, part: &str| format!("level{l}.csr_{kind}.{part}");
     let matrices = (1..=3).flat_map(|l| {

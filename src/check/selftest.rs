@@ -5,41 +5,25 @@
 //! operation. What each operation must give is stored as a digest of its bits. They are the same on every instruction
 //! set and number of threads, so a difference means that the machine, the build or the model's bytes are at fault.
 
+pub use crate::model::selftest::{KEY, SelfTest};
+
 use crate::base::digest;
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::base::random::Random;
 use crate::base::threads::Threads;
 use crate::file::container::{self, Data, Tensor};
+use crate::graph::Elements;
 use crate::image::ImageView;
 use crate::model::{self, Model};
 use crate::network::Network;
 use crate::rig::RigBuilder;
 use crate::runtime::session::{Session, SessionOptions};
-use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
 use voxcast_kernels::Isa;
 
-/// Metadata key of a model file under which its self-test stands, as JSON.
-pub const KEY: &str = "self_test";
-
 /// The seed of the stimulus that [`record`] stores.
 const SEED: u64 = 1;
-
-/// A stimulus and what it must give.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct SelfTest {
-    /// What the images are drawn from.
-    pub seed: u64,
-    /// Per operation in running order, of each camera in turn: its name and 16 hexadecimal digits, the
-    /// [digest](crate::base::digest::floats) of what it writes.
-    pub operations: Vec<(String, String)>,
-    /// Digest of the classes.
-    pub classes: String,
-    /// Digest of the logits.
-    pub logits: String,
-}
 
 /// The first operation whose result is not what it must be.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -132,11 +116,19 @@ fn compute(
     let images: Vec<_> = stimulus.images.iter().map(|bgr| ImageView::bgr(height, width, bgr)).collect();
     let result = session.run_observed(&images, &mut |event| {
         let operation = event.operation;
-        see(&operation.name, operation.stage.as_deref(), event.camera, digest::floats(event.output));
+        see(&operation.name, operation.stage.as_deref(), event.camera, digest_of(event.output));
     })?;
     see("logits", None, None, digest::floats(result.logits.unwrap_or_default()));
     see("classes", None, None, digest::bytes(result.classes));
     Ok(())
+}
+
+/// Digest of what an operation wrote.
+fn digest_of(elements: Elements<'_>) -> u64 {
+    match elements.get() {
+        Some(values) => digest::floats(values),
+        None => digest::bytes(elements.bytes()),
+    }
 }
 
 fn hex(digest: u64) -> String {

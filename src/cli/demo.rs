@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use voxcast::eval::Confusion;
+use voxcast::network::Grid;
 use voxcast::picture::{self, Figure, Palette};
-use voxcast::scene::forward_of;
 use voxcast::session::{Occupancy, views};
 use voxcast::synth::{CLASSES, Frame, Synthesiser};
 use voxcast::{Error, Model, Network, Result, Session};
@@ -112,8 +112,8 @@ fn score(drawn: &Frame, result: &Occupancy<'_>) -> String {
 /// The picture: images, prediction and truth.
 fn draw(path: &Path, network: &Network, drawn: &Frame, result: &Occupancy<'_>, score: &str) -> Result<()> {
     let palette = Palette::of(network.classes);
-    let forward = forward_of(&network.bounds);
-    let occupancy = |caption, classes| picture::Occupancy::new(caption, classes, result.grid, network.bounds, forward);
+    let grid = Grid::of(network);
+    let occupancy = |caption, classes| picture::Occupancy::new(caption, classes, grid, grid.forward());
     let occupancies =
         [occupancy("prediction", result.classes)?.with_support(result.support)?, occupancy("truth", &drawn.labels)?];
     let images: Vec<_> = drawn.scene.names.iter().map(String::as_str).zip(&drawn.scene.images).collect();

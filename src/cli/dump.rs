@@ -4,7 +4,7 @@ use safetensors::Dtype;
 use std::collections::BTreeMap;
 use std::path::Path;
 use voxcast::container::{self, Data, Layout, Tensor};
-use voxcast::graph::{Graph, Op, Rewrites};
+use voxcast::graph::{Elements, Graph, Results, Rewrites, Section, Space};
 use voxcast::session::Event;
 use voxcast::{Error, ErrorKind, Network, Result, Rig};
 
@@ -15,8 +15,8 @@ pub struct Dump {
     stages: BTreeMap<String, Stage>,
 }
 
-#[derive(Default)]
 struct Stage {
+    dtype: Dtype,
     shape: Vec<usize>,
     bytes: Vec<u8>,
 }
@@ -33,7 +33,7 @@ impl Dump {
     /// # Errors
     /// If a name is not a stage of the network.
     pub fn new(stages: Option<&str>, network: &Network) -> Result<Self> {
-        let full = Graph::build(network, true);
+        let full = Graph::build(network, Results::ALL);
         let mut known: Vec<String> = full.stages().map(str::to_owned).collect();
         known.extend((0..3).flat_map(matrix_names));
         known.push("classes".to_owned());
@@ -41,7 +41,7 @@ impl Dump {
             None => known.clone(),
             Some(list) => list.split(',').map(|s| s.trim().to_owned()).collect(),
         };
-        let folded = Graph::build(network, true).rewritten(Rewrites::ALL);
+        let folded = Graph::build(network, Results::ALL).rewritten(Rewrites::ALL);
         let operations: Vec<&String> = full.operations.iter().chain(&folded.operations).map(|o| &o.name).collect();
         if let Some(bad) = wanted.iter().find(|w| !known.contains(w) && !operations.contains(w)) {
             let message =
@@ -54,7 +54,7 @@ impl Dump {
     /// Whether a stage is wanted that the projection fold removes.
     pub fn needs_unfolded(&self, network: &Network) -> bool {
         let [full, folded] = [Rewrites { projection: false, ..Rewrites::ALL }, Rewrites::ALL].map(|rewrites| {
-            let graph = Graph::build(network, true).rewritten(rewrites);
+            let graph = Graph::build(network, Results::ALL).rewritten(rewrites);
             graph.stages().map(str::to_owned).collect::<Vec<_>>()
         });
         self.wanted.iter().any(|w| full.contains(w) && !folded.contains(w))
@@ -74,18 +74,22 @@ impl Dump {
     pub fn observe(&mut self, graph: &Graph, event: &Event<'_>) {
         let names = [event.operation.stage.as_deref(), Some(event.operation.name.as_str())];
         let Some(name) = names.into_iter().flatten().find(|name| self.wants(name)) else { return };
-        let tensor = graph.tensor(event.operation.output);
-        let stage = self.stages.entry(name.to_owned()).or_default();
-        if matches!(event.operation.op, Op::Head { .. }) {
+        let tensor = graph.tensor(event.operation.result());
+        let empty = || Stage { dtype: tensor.element.into(), shape: vec![], bytes: vec![] };
+        let stage = self.stages.entry(name.to_owned()).or_insert_with(empty);
+        if tensor.section == Section::Head {
+            // Channels last, as the result is.
             stage.shape = tensor.extent.iter().copied().chain([tensor.channels]).collect();
-            stage.bytes = bytemuck::cast_slice(event.output).to_vec();
+            stage.bytes = event.output.bytes().to_vec();
             return;
         }
         let batch = event.camera.map_or(1, |camera| camera + 1);
-        let plane = tensor.extent[0] == 1 && (event.camera.is_some() || !is_volume(name));
-        let extent = if plane { &tensor.extent[1..] } else { &tensor.extent[..] };
+        let extent = match tensor.space {
+            Space::Volume => &tensor.extent[..],
+            Space::Image | Space::Plane => &tensor.extent[1..],
+        };
         stage.shape = [batch, tensor.channels].into_iter().chain(extent.iter().copied()).collect();
-        stage.bytes.extend_from_slice(bytemuck::cast_slice(&channels_first(event.output, tensor.channels)));
+        stage.bytes.extend(channels_first(event.output, tensor.channels));
     }
 
     /// Adds matrices and classes and writes all of it to `directory/stages.safetensors`.
@@ -93,24 +97,21 @@ impl Dump {
         for level in 0..3 {
             let matrices = rig.level(level);
             let parts = [matrices.volume.ptr, matrices.volume.col, matrices.bev.ptr, matrices.bev.col];
-            for (name, numbers) in matrix_names(level).into_iter().zip(parts) {
+            for (name, words) in matrix_names(level).into_iter().zip(parts) {
                 if self.wants(&name) {
-                    let bytes = numbers.iter().flat_map(|&n| i64::from(n).to_le_bytes()).collect();
-                    self.stages.insert(name, Stage { shape: vec![numbers.len()], bytes });
+                    let bytes = words.iter().flat_map(|&n| i64::from(n).to_le_bytes()).collect();
+                    self.stages.insert(name, Stage { dtype: Dtype::I64, shape: vec![words.len()], bytes });
                 }
             }
         }
         if self.wants("classes") {
-            self.stages.insert("classes".to_owned(), Stage { shape: grid.to_vec(), bytes: classes.to_vec() });
+            let stage = Stage { dtype: Dtype::U8, shape: grid.to_vec(), bytes: classes.to_vec() };
+            self.stages.insert("classes".to_owned(), stage);
         }
         std::fs::create_dir_all(directory).map_err(|e| Error::io(directory, "create", &e))?;
         let tensors = self.stages.iter().map(|(name, stage)| Tensor {
             name: name.clone(),
-            dtype: match name.as_str() {
-                "classes" => Dtype::U8,
-                name if name.contains(".csr_") => Dtype::I64,
-                _ => Dtype::F32,
-            },
+            dtype: stage.dtype,
             shape: stage.shape.clone(),
             data: Data::Bytes(&stage.bytes),
         });
@@ -118,20 +119,14 @@ impl Dump {
     }
 }
 
-/// Whether the result is a volume even when it is one voxel wide.
-fn is_volume(name: &str) -> bool {
-    let parts = ["volume", "fused", "conv3d", "up_sample", "refine", "combine_coeff"];
-    parts.iter().any(|part| name.contains(part))
-}
-
-/// `[rows, channels]` to `[channels, rows]`.
-fn channels_first(values: &[f32], channels: usize) -> Vec<f32> {
-    let rows = values.len() / channels.max(1);
-    let mut out = vec![0.0; values.len()];
-    for (row, values) in values.chunks_exact(channels).enumerate() {
-        for (c, &value) in values.iter().enumerate() {
-            out[c * rows + row] = value;
-        }
+/// The bytes of `[rows, channels]` as `[channels, rows]`.
+fn channels_first(elements: Elements<'_>, channels: usize) -> Vec<u8> {
+    let size = elements.element().bytes();
+    let rows = elements.len() / channels.max(1);
+    let mut out = vec![0; elements.bytes().len()];
+    for (i, element) in elements.bytes().chunks_exact(size).enumerate() {
+        let at = (i % channels * rows + i / channels) * size;
+        out[at..at + size].copy_from_slice(element);
     }
     out
 }

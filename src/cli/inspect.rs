@@ -4,6 +4,7 @@ use super::{ThreadCount, terminal};
 use clap::Args;
 use std::path::PathBuf;
 use voxcast::container::Container;
+use voxcast::graph::Results;
 use voxcast::{Error, Model, Network, Result, Rig, Session, SessionOptions};
 
 /// Say what is in a model or a rig: shapes, precisions, sizes, the memory a session takes, checksum.
@@ -48,7 +49,7 @@ impl Inspect {
         let network = model.network();
         let options = SessionOptions { threads: self.threads.threads()?, ..SessionOptions::default() };
         let cameras = self.cameras.map_or(network.cameras, usize::from);
-        let graph = model.graph(false, false);
+        let graph = model.graph(false, Results::default());
         let memory = Session::memory(&model, cameras, &options).map_err(|e| e.in_file(&self.file))?;
         let parameters: usize = model.tensors().map(|(_, _, len)| len).sum();
         let multiply_adds: u64 = (0..graph.operations.len())
@@ -102,7 +103,7 @@ impl Inspect {
         println!("network    {}", network.to_json());
         if self.operations {
             for (i, operation) in graph.operations.iter().enumerate() {
-                let tensor = graph.tensor(operation.output);
+                let tensor = graph.tensor(operation.result());
                 println!(
                     "{:>4} {:60} {:?} x {:<5} {:>8.3} GMAC{}",
                     i,

@@ -76,7 +76,10 @@ impl Arguments {
             Command::Demo(command) => command.run(),
             Command::Import(command) => command.run(),
             Command::Rig(command) => command.run(),
-            Command::Run(command) => command.run(),
+            Command::Run(command) => match sequence::scenes(&command.scene)? {
+                Some(scenes) => command.run_sequence(&scenes),
+                None => command.run(),
+            },
             Command::View(command) => command.run(),
             Command::Inspect(command) => command.run(),
             Command::Profile(command) => command.run(),

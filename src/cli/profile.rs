@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use voxcast::graph::{Graph, Op};
+use voxcast::graph::Graph;
 use voxcast::session::{Event, views};
 use voxcast::{Budget, Error, ImageView, Isa, Result, Session, Step, Threads};
 
@@ -21,7 +21,20 @@ Examples:
   voxcast profile --model model.safetensors scene/ --trace trace.json    (open in chrome://tracing or Perfetto)
 
 A step of a controller overruns its time by one slice at most. The column `slice` is the longest of each row, over as many
-frames as are timed, the line at the end the longest of all. On a shared machine, it holds what others did meanwhile.")]
+frames as are timed, the line at the end the longest of all. On a shared machine, it holds what others did meanwhile.
+GMAC are billions of multiply-adds as the network has them; the share of the peak counts those that the kernels execute.
+
+Keys of --json:
+  frame_seconds                  median time of a whole frame
+  threads                        threads that computed
+  peak_multiply_adds_per_second  of all threads, register to register, measured between the frames
+  multiply_adds                  of a frame, as the network has them
+  executed_multiply_adds         of a frame, as the kernels execute them
+  slices                         slices of a frame that is run in steps
+  longest_slice_seconds          the longest of them
+  longest_slice_operation        what it was a part of
+  rows                           the table: of each name the median of its seconds in a frame, all cameras together, its
+                                 longest_slice_seconds, multiply_adds and executed_multiply_adds")]
 pub struct Profile {
     /// The model
     #[arg(long)]
@@ -59,7 +72,10 @@ struct Row {
     seconds: Vec<f64>,
     /// Of the longest slice.
     slice: f64,
+    /// As the network has them.
     multiply_adds: u64,
+    /// As the kernels execute them.
+    executed: u64,
 }
 
 /// Frames in slices.
@@ -123,20 +139,25 @@ impl Profile {
         let mut rows: Vec<Row> = vec![];
         for (i, operation) in graph.operations.iter().enumerate() {
             let name = match self.by.as_str() {
-                "kind" => kind(&operation.op).to_owned(),
-                "part" => part(&operation.name),
+                "kind" => operation.op.description().kind().to_owned(),
+                "part" => graph.tensor(operation.output()).section.to_string(),
                 _ => operation.name.clone(),
             };
             let times = if i < graph.camera_operations { cameras as u64 } else { 1 };
             let work = graph.multiply_adds(operation) * times;
+            let executed = graph.executed_multiply_adds(operation) * times;
             let slice = sliced.longest[i];
             match rows.iter_mut().find(|r| r.name == name) {
                 Some(row) => {
                     row.multiply_adds += work;
+                    row.executed += executed;
                     row.slice = row.slice.max(slice);
                     row.seconds.iter_mut().zip(&seconds[i][1..]).for_each(|(sum, s)| *sum += s);
                 }
-                None => rows.push(Row { name, seconds: seconds[i][1..].to_vec(), slice, multiply_adds: work }),
+                None => {
+                    let seconds = seconds[i][1..].to_vec();
+                    rows.push(Row { name, seconds, slice, multiply_adds: work, executed });
+                }
             }
         }
         rows
@@ -144,21 +165,22 @@ impl Profile {
 
     fn print(&self, rows: Vec<Row>, frame: f64, peak: f64, threads: usize, slices: usize, worst: &str) {
         let total: u64 = rows.iter().map(|r| r.multiply_adds).sum();
+        let total_executed: u64 = rows.iter().map(|r| r.executed).sum();
         let longest = rows.iter().map(|r| r.slice).fold(0.0, f64::max);
-        let rows: Vec<_> =
-            rows.into_iter().map(|mut r| (r.name, median(&mut r.seconds), r.slice, r.multiply_adds)).collect();
+        let rows: Vec<_> = rows.into_iter().map(|mut r| (median(&mut r.seconds), r)).collect();
         if self.json {
             let rows: Vec<_> = rows
                 .iter()
-                .map(|(name, s, slice, work)| {
+                .map(|(seconds, row)| {
                     serde_json::json!({
-                        "name": name, "seconds": s, "longest_slice_seconds": slice, "multiply_adds": work,
+                        "name": row.name, "seconds": seconds, "longest_slice_seconds": row.slice,
+                        "multiply_adds": row.multiply_adds, "executed_multiply_adds": row.executed,
                     })
                 })
                 .collect();
             let value = serde_json::json!({
                 "frame_seconds": frame, "peak_multiply_adds_per_second": peak, "threads": threads,
-                "multiply_adds": total, "rows": rows, "slices": slices,
+                "multiply_adds": total, "executed_multiply_adds": total_executed, "rows": rows, "slices": slices,
                 "longest_slice_seconds": longest, "longest_slice_operation": worst,
             });
             println!("{value:#}");
@@ -168,13 +190,14 @@ impl Profile {
             "{:58} {:>10} {:>6} {:>9} {:>9} {:>6} {:>10}",
             self.by, "median", "share", "GMAC", "GMAC/s", "peak", "slice"
         );
-        for (name, s, slice, work) in &rows {
+        for (s, Row { name, slice, multiply_adds: work, executed, .. }) in &rows {
             let rate = *work as f64 / s;
             let (gmac, rate, share) = if *work == 0 {
                 (String::new(), String::new(), String::new())
             } else {
                 let gmac = format!("{:.3}", *work as f64 / 1e9);
-                (gmac, format!("{:.1}", rate / 1e9), format!("{:.0} %", 100.0 * rate / peak))
+                let share = *executed as f64 / s / peak;
+                (gmac, format!("{:.1}", rate / 1e9), format!("{:.0} %", 100.0 * share))
             };
             println!(
                 "{name:58} {:>10} {:>5.1}% {gmac:>9} {rate:>9} {share:>6} {:>10}",
@@ -188,7 +211,7 @@ impl Profile {
             terminal::time(Duration::from_secs_f64(frame)),
             total as f64 / 1e9,
             total as f64 / frame / 1e9,
-            100.0 * total as f64 / frame / peak,
+            100.0 * total_executed as f64 / frame / peak,
             peak / 1e9
         );
         println!(
@@ -235,47 +258,6 @@ fn median(values: &mut [f64]) -> f64 {
     values[values.len() / 2]
 }
 
-fn kind(op: &Op) -> &'static str {
-    match op {
-        Op::Normalise => "normalise",
-        Op::Conv { geometry } if geometry.kernel == [1; 3] => "conv 1x1",
-        Op::Conv { geometry } if geometry.kernel[0] == 1 => "conv2d",
-        Op::Conv { .. } => "conv3d",
-        Op::DeformConv { .. } => "deform_conv2d",
-        Op::Depthwise { .. } => "depthwise",
-        Op::BatchNorm => "scale_shift",
-        Op::MaxPool { .. } => "max_pool",
-        Op::UpsampleAdd => "upsample_add",
-        Op::Gather { .. } => "gather",
-        Op::Deconv => "deconv3d",
-        Op::WindowAttention { .. } => "window_attention",
-        Op::Gate => "gate",
-        Op::GlobalMean | Op::Broadcast => "pool",
-        Op::Head { .. } => "head",
-    }
-}
-
-/// The part of the network that an operation belongs to: backbone stage, pyramid, level, refinement, head.
-fn part(name: &str) -> String {
-    let mut words = name.split('.');
-    match (words.next(), words.next(), words.next()) {
-        (Some("img_backbone"), Some(stage), _) if stage.starts_with("layer") => format!("backbone {stage}"),
-        (Some("image" | "img_backbone"), ..) => "backbone stem".to_owned(),
-        (Some("img_neck"), ..) => "pyramid".to_owned(),
-        (Some("view_transformer"), Some("imvts"), Some(level)) => {
-            let level = level.parse().map_or(0, |l: usize| l + 1);
-            let branch = match name {
-                n if n.contains(".gather.") => "gather",
-                n if n.contains("conv3d") || n.contains("combine") => "volume",
-                _ => "bev",
-            };
-            format!("level {level} {branch}")
-        }
-        (Some("view_transformer"), Some(part), _) => part.to_owned(),
-        _ => "head".to_owned(),
-    }
-}
-
 /// Chrome's trace event format: one complete event per operation, one row per camera.
 fn write_trace(path: &Path, graph: &Graph, trace: &[(usize, Option<usize>, Duration, Duration)]) -> Result<()> {
     let events: Vec<_> = trace
@@ -283,7 +265,7 @@ fn write_trace(path: &Path, graph: &Graph, trace: &[(usize, Option<usize>, Durat
         .map(|(index, camera, end, elapsed)| {
             let operation = &graph.operations[*index];
             serde_json::json!({
-                "name": operation.name, "cat": kind(&operation.op), "ph": "X", "pid": 0,
+                "name": operation.name, "cat": operation.op.description().kind(), "ph": "X", "pid": 0,
                 "tid": camera.map_or("frame".to_owned(), |c| format!("camera {c}")),
                 "ts": end.saturating_sub(*elapsed).as_secs_f64() * 1e6, "dur": elapsed.as_secs_f64() * 1e6,
                 "args": {"multiply_adds": graph.multiply_adds(operation)},

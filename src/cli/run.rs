@@ -1,7 +1,6 @@
 //! `voxcast run`
 
 use super::dump::Dump;
-use super::sequence;
 use super::view::name_of;
 use super::{Machine, frame, terminal};
 use clap::Args;
@@ -10,9 +9,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use voxcast::html::Page;
+use voxcast::network::Grid;
 use voxcast::npz::{Array, Elements, write_npz};
 use voxcast::picture::{self, Figure, Palette};
-use voxcast::scene::forward_of;
 use voxcast::session::{Occupancy, views};
 use voxcast::{Error, Network, Result, Scene};
 
@@ -88,9 +87,6 @@ pub struct Run {
 
 impl Run {
     pub fn run(self) -> Result<()> {
-        if let Some(scenes) = sequence::scenes(&self.scene)? {
-            return self.run_sequence(&scenes);
-        }
         if self.animation.is_some() {
             let message = "--animation needs a directory of scenes, and this is one scene";
             return Err(Error::mismatch(message).in_file(&self.scene));
@@ -197,9 +193,8 @@ pub fn write_page(
     [title, subtitle]: [&str; 2],
 ) -> Result<()> {
     let palette = Palette::of(network.classes);
-    let prediction =
-        picture::Occupancy::new("", result.classes, result.grid, network.bounds, forward_of(&network.bounds))?
-            .with_support(result.support)?;
+    let prediction = picture::Occupancy::new("", result.classes, Grid::of(network), Grid::of(network).forward())?
+        .with_support(result.support)?;
     Page { title, subtitle, prediction, truth, scene, palette: &palette }.write(path)
 }
 
@@ -212,9 +207,8 @@ pub fn draw(
     subtitle: &str,
 ) -> Result<picture::Picture> {
     let palette = Palette::of(network.classes);
-    let occupancy =
-        picture::Occupancy::new("", result.classes, result.grid, network.bounds, forward_of(&network.bounds))?
-            .with_support(result.support)?;
+    let occupancy = picture::Occupancy::new("", result.classes, Grid::of(network), Grid::of(network).forward())?
+        .with_support(result.support)?;
     let images: Vec<_> = scene.names.iter().map(String::as_str).zip(&scene.images).collect();
     Ok(picture::draw(&Figure { title, subtitle, images: &images, occupancies: &[occupancy], palette: &palette }))
 }

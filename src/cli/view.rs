@@ -5,9 +5,9 @@ use clap::Args;
 use std::path::{Path, PathBuf};
 use voxcast::html::Page;
 use voxcast::labels::read_labels;
+use voxcast::network::Grid;
 use voxcast::npz::{OwnedArray, OwnedElements, read_npz};
 use voxcast::picture::{Class, Occupancy, Palette};
-use voxcast::scene::forward_of;
 use voxcast::{Error, Network, Result, Scene};
 
 /// Make a page of a result, to look at in a browser.
@@ -136,7 +136,8 @@ impl Stored {
     }
 
     fn occupancy(&self) -> Result<Occupancy<'_>> {
-        let occupancy = Occupancy::new("", &self.classes, self.grid, self.bounds, forward_of(&self.bounds))?;
+        let grid = Grid::new(self.grid, self.bounds);
+        let occupancy = Occupancy::new("", &self.classes, grid, grid.forward())?;
         if self.support.is_empty() { Ok(occupancy) } else { occupancy.with_support(&self.support) }
     }
 }

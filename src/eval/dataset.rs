@@ -13,63 +13,14 @@ pub use pose::Pose;
 pub use semantickitti::SemanticKitti;
 pub use synthetic::Synthetic;
 
+pub use crate::network::{Axes, Grid};
+
 use crate::base::error::{Error, Result};
-use crate::network::Network;
 use crate::scene::Scene;
 use std::path::{Component, Path};
 
 /// Label of a voxel about which nothing is known, or which no score counts.
 pub const IGNORED: u8 = crate::file::labels::UNLABELLED;
-
-/// Where voxels lie: how many along each axis, and their metres in some frame of reference.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Grid {
-    /// Voxels along x, y, z.
-    pub size: [usize; 3],
-    /// [min, max] of x, of y, of z in metres.
-    pub bounds: [[f32; 2]; 3],
-    /// In whose frame these are.
-    pub axes: Axes,
-}
-
-impl Grid {
-    /// The output grid of a network.
-    pub fn of(network: &Network) -> Self {
-        Self { size: network.output_grid(), bounds: network.bounds, axes: Axes::Lidar }
-    }
-
-    /// Voxels in all.
-    pub fn voxels(&self) -> usize {
-        self.size.iter().product()
-    }
-
-    /// Edge of a voxel along `axis` in metres.
-    pub fn edge(&self, axis: usize) -> f64 {
-        let [low, high] = self.bounds[axis].map(f64::from);
-        (high - low) / self.size[axis] as f64
-    }
-
-    /// Centre of the voxels at `index` along `axis`, in metres.
-    pub fn centre(&self, axis: usize, index: usize) -> f64 {
-        f64::from(self.bounds[axis][0]) + (index as f64 + 0.5) * self.edge(axis)
-    }
-
-    /// Index along `axis` of the voxels that contain `metres`; none outside.
-    pub fn index(&self, axis: usize, metres: f64) -> Option<usize> {
-        let index = ((metres - f64::from(self.bounds[axis][0])) / self.edge(axis)).floor();
-        (index >= 0.0 && index < self.size[axis] as f64).then_some(index as usize)
-    }
-}
-
-/// The frame of reference of a grid.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Axes {
-    /// The lidar's, in which networks see.
-    #[default]
-    Lidar,
-    /// The vehicle's, in which the lidar is mounted somewhere.
-    Ego,
-}
 
 /// What is known about a frame's voxels, `[x, y, z]`, z fastest.
 #[derive(Clone, Debug, PartialEq)]

@@ -1,7 +1,6 @@
 //! Where the bytes of an open file are: mapped, in the program, or copied to memory that nobody else can change.
 
 use crate::base::error::{Error, ErrorKind, Result};
-use crate::file::container::ALIGNMENT;
 use bytemuck::{Pod, Zeroable};
 use memmap2::Mmap;
 use std::borrow::Cow;
@@ -9,6 +8,9 @@ use std::fs::{self, File};
 use std::io::Read;
 use std::ops::Deref;
 use std::path::Path;
+
+/// Files of tensors have them, and their data as a whole, start on multiples of this many bytes: a cache line.
+pub const ALIGNMENT: usize = 64;
 
 /// The strictest alignment of an element that is read in place.
 const ELEMENT: usize = align_of::<f32>();

@@ -12,6 +12,8 @@
 //! must have the key, so that no damage can hide it. Other safetensors files need neither.
 
 use crate::base::error::{Error, ErrorKind, Result};
+pub use crate::file::backing::ALIGNMENT;
+
 use crate::file::backing::Backing;
 use crate::file::replace::Replacement;
 use safetensors::Dtype;
@@ -21,9 +23,6 @@ use std::collections::BTreeMap;
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::path::Path;
 use xxhash_rust::xxh3::Xxh3;
-
-/// Tensors of [`Layout::Aligned`] and the data as a whole start on multiples of this many bytes: a cache line.
-pub const ALIGNMENT: usize = 64;
 
 /// No header may be longer. A thousand tensors need a tenth of a mebibyte.
 const MAX_HEADER: u64 = 64 << 20;

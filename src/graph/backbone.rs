@@ -1,12 +1,26 @@
 //! ResNet, caffe style, with modulated deformable convolution in the stages that the network says.
 
-use super::{After, Builder, ConvNames, ConvShape, Op, Recipe, TensorId};
+use super::builder::{After, Builder, ConvShape};
+use super::element::Element;
+use super::ops::{DeformConv, MaxPool, Normalise};
+use super::recipe::{ConvNames, Recipe};
+use super::tensor::{Lifetime, Scope, Section, Space, Tensor, TensorId};
 use crate::network::{Block, Network};
 
 /// Image to C3, C4, C5.
 pub(super) fn build(b: &mut Builder, network: &Network) -> [TensorId; 3] {
     let [height, width] = network.image;
-    let image = b.push("image", Op::Normalise, &[], [1, height, width], 3);
+    let bgr = b.add(Tensor {
+        name: "image.bgr".to_owned(),
+        element: Element::U8,
+        space: Space::Image,
+        section: Section::Stem,
+        scope: Scope::Input,
+        lifetime: Lifetime::Camera,
+        extent: [1, height, width],
+        channels: 3,
+    });
+    let image = b.push_like("image", Normalise, &[bgr], bgr);
     b.stage("image.input");
     let stem = b.conv(
         "img_backbone.conv1",
@@ -15,10 +29,12 @@ pub(super) fn build(b: &mut Builder, network: &Network) -> [TensorId; 3] {
         ConvShape::image(7, 2, network.width),
         After::norm_relu("img_backbone.bn1"),
     );
-    let pool = Op::MaxPool { side: 3, stride: 2, padding: 1 };
-    let mut x = b.push("img_backbone.maxpool", pool, &[stem], [1, height / 4, width / 4], network.width);
+    let pool = MaxPool { side: 3, stride: 2, padding: 1 };
+    let quarter = (Space::Image, [1, height / 4, width / 4]);
+    let mut x = b.push("img_backbone.maxpool", pool, &[stem], quarter, network.width);
     let mut stages = vec![];
     for stage in 0..4 {
+        b.section = Section::Stage(stage + 1);
         for index in 0..network.depths[stage] {
             let prefix = format!("img_backbone.layer{}.{index}", stage + 1);
             let stride = if stage > 0 && index == 0 { 2 } else { 1 };
@@ -52,9 +68,10 @@ fn bottleneck(b: &mut Builder, network: &Network, prefix: &str, x: TensorId, sta
     let conv2 = format!("{prefix}.conv2");
     let shape = ConvShape::image(3, 1, width);
     let y = if network.dcn[stage] {
-        let offsets = b.conv(&format!("{conv2}.conv_offset"), true, y, ConvShape::image(3, 1, 27), After::default());
         let geometry = shape.geometry(b.graph.tensor(y));
-        let z = b.push(&conv2, Op::DeformConv { geometry }, &[y, offsets], geometry.output, width);
+        let offsets = ConvShape::image(3, 1, DeformConv::offset_channels(geometry.kernel.iter().product()));
+        let offsets = b.conv(&format!("{conv2}.conv_offset"), true, y, offsets, After::default());
+        let z = b.push(&conv2, DeformConv { geometry }, &[y, offsets], (Space::Image, geometry.output), width);
         b.last().recipe = Recipe::Conv(ConvNames { prefix: conv2, bias: false, norm: None });
         b.after(z, After::norm_relu(&bn2))
     } else {

@@ -1,15 +1,35 @@
 //! The occupancy heads.
 
-use super::{Builder, Op, Recipe, TensorId};
+use super::builder::Builder;
+use super::element::Element;
+use super::ops::Head;
+use super::options::Results;
+use super::recipe::Recipe;
+use super::tensor::{Scope, Section, Tensor, TensorId};
 use crate::network::Network;
 
-/// The volumes of levels 0 to 3 to classes; only level 0 unless `coarse`.
-pub(super) fn build(b: &mut Builder, network: &Network, volumes: [TensorId; 4], coarse: bool) {
-    for level in (0..if coarse { 4 } else { 1 }).rev() {
+/// The volumes of levels 0 to 3 to classes. What is no result of the frame is for observers.
+pub(super) fn build(b: &mut Builder, network: &Network, volumes: [TensorId; 4], results: Results) {
+    let Results { logits, coarse_heads } = results;
+    b.section = Section::Head;
+    for level in (0..if coarse_heads { 4 } else { 1 }).rev() {
         let name = format!("occ_head.mlp_occ_lvl{level}");
-        let extent = b.graph.tensor(volumes[level]).extent;
-        b.push(&name, Op::Head { level }, &[volumes[level]], extent, network.classes);
-        b.last().recipe = Recipe::Head(name);
+        let x = b.graph.tensor(volumes[level]).clone();
+        let scope = |kept: bool| if level == 0 && kept { Scope::Output } else { Scope::Inner };
+        let result = |what: &str, element, scope, channels| Tensor {
+            name: format!("{name}.{what}"),
+            element,
+            section: Section::Head,
+            scope,
+            channels,
+            ..x.clone()
+        };
+        let mut outputs = vec![b.add(result("classes", Element::U8, scope(true), 1))];
+        if logits || coarse_heads {
+            outputs.push(b.add(result("logits", Element::F32, scope(logits), network.classes)));
+        }
+        b.push_into(&name, Head { classes: network.classes }, &[volumes[level]], &outputs, 0, 1);
+        b.last().recipe = Recipe::Module(name);
         b.stage(format!("logits.lvl{level}"));
     }
 }

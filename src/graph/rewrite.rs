@@ -1,6 +1,10 @@
 //! Graph-to-graph functions that keep the result and lessen the work.
 
-use super::{ConvNames, Graph, Matrix, Op, Operation, Recipe, TensorId};
+use super::matrices::Matrix;
+use super::operation::{Graph, Operation};
+use super::ops::{BatchNorm, Conv, Gather, Op};
+use super::recipe::{ConvNames, Recipe};
+use super::tensor::TensorId;
 use voxcast_kernels::conv::Geometry;
 
 impl Graph {
@@ -11,17 +15,17 @@ impl Graph {
         let mut camera_operations = 0;
         for (index, operation) in std::mem::take(&mut self.operations).into_iter().enumerate() {
             let producer = kept.last_mut().filter(|p| {
-                operation.op == Op::BatchNorm
-                    && operation.inputs == [p.output]
+                operation.op == Op::BatchNorm(BatchNorm)
+                    && operation.inputs == [p.output()]
                     && operation.first_channel == p.first_channel
                     && matches!(&p.recipe, Recipe::Conv(names) if names.norm.is_none())
             });
             match producer {
                 Some(producer) => {
-                    if let (Recipe::Conv(names), Recipe::BatchNorm(norm)) = (&mut producer.recipe, operation.recipe) {
+                    if let (Recipe::Conv(names), Recipe::Module(norm)) = (&mut producer.recipe, operation.recipe) {
                         names.norm = Some(norm);
                     }
-                    producer.output = operation.output;
+                    producer.outputs = operation.outputs;
                     producer.relu = operation.relu;
                     producer.residual = operation.residual;
                     producer.stage = operation.stage;
@@ -55,9 +59,10 @@ impl Graph {
             return;
         };
         let features = self.operations[volume.gather].inputs[0];
-        let Some(pixel) = self.operations.iter().position(|o| o.output == features) else { return };
+        let Some(pixel) = self.operations.iter().position(|o| o.output() == features) else { return };
         let Recipe::Conv(pixel_names) = self.operations[pixel].recipe.clone() else { return };
         let channels = self.operations[volume.conv].channels;
+        let inputs = self.tensor(features).channels;
 
         let operation = &mut self.operations[pixel];
         operation.name = format!("{}.projected", pixel_names.prefix);
@@ -70,15 +75,16 @@ impl Graph {
         for (branch, first) in [(&volume, 0), (&bev, channels)] {
             let conv = self.operations[branch.conv].clone();
             let gather = &mut self.operations[branch.gather];
-            if let Op::Gather { first_channel, bias, .. } = &mut gather.op {
-                *first_channel = first;
-                *bias = true;
+            if let Op::Gather(gather) = &mut gather.op {
+                gather.first_channel = first;
             }
-            gather.output = conv.output;
+            let section = self.tensors[gather.output().0].section;
+            self.tensors[conv.output().0].section = section;
+            gather.outputs = conv.outputs;
             gather.channels = channels;
             gather.relu = conv.relu;
             gather.stage = conv.stage;
-            gather.recipe = Recipe::Bias(branch.names.clone());
+            gather.recipe = Recipe::Bias { names: branch.names.clone(), inputs };
         }
         let mut gone = [volume.conv, bev.conv];
         gone.sort_unstable();
@@ -90,12 +96,12 @@ impl Graph {
     /// A gather and the 1x1 convolution that alone reads it.
     fn branch(&self, level: usize, matrix: Matrix) -> Option<Branch> {
         let gather = self.operations.iter().position(
-            |o| matches!(o.op, Op::Gather { level: l, matrix: m, bias: false, .. } if l == level && m == matrix),
+            |o| matches!(o.op, Op::Gather(Gather { level: l, matrix: m, .. }) if l == level && m == matrix && o.recipe == Recipe::None),
         )?;
-        let rows = self.operations[gather].output;
+        let rows = self.operations[gather].output();
         let conv = self.only_reader(rows)?;
         match (&self.operations[conv].op, &self.operations[conv].recipe) {
-            (Op::Conv { geometry: Geometry { kernel: [1, 1, 1], .. } }, Recipe::Conv(names)) => {
+            (Op::Conv(Conv { geometry: Geometry { kernel: [1, 1, 1], .. } }), Recipe::Conv(names)) => {
                 Some(Branch { gather, conv, names: names.clone() })
             }
             _ => None,

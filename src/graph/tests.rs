@@ -1,10 +1,13 @@
 //! The graph against the figures that are known of the published network.
 
+use super::ops::{BatchNorm, Conv, DeformConv};
 use super::*;
+use crate::network::Network;
 use std::collections::BTreeSet;
+use voxcast_kernels::conv::Geometry;
 
 fn full() -> Graph {
-    Graph::build(&Network::built_in("nuscenes-200").expect("built in"), true)
+    Graph::build(&Network::built_in("nuscenes-200").expect("built in"), Results::ALL)
 }
 
 /// Billions of multiply-adds of a frame of six cameras, of the operations that `wanted` picks.
@@ -19,18 +22,22 @@ fn assert_near(found: f64, expected: f64, what: &str) {
     assert!((found - expected).abs() <= 1.0, "{what}: {found:.2}, expected {expected}");
 }
 
-fn side(operation: &Operation) -> Option<usize> {
+fn geometry(operation: &Operation) -> Option<Geometry> {
     match operation.op {
-        Op::Conv { geometry } | Op::DeformConv { geometry } => Some(geometry.kernel[2]),
+        Op::Conv(Conv { geometry }) | Op::DeformConv(DeformConv { geometry }) => Some(geometry),
         _ => None,
     }
 }
 
+fn side(operation: &Operation) -> Option<usize> {
+    geometry(operation).map(|g| g.kernel[2])
+}
+
 #[test]
 fn multiply_adds_are_the_published_ones() {
-    let graph = Graph::build(&full().network, false).fold_batch_norm();
+    let graph = Graph::build(&full().network, Results::default()).fold_batch_norm();
     let backbone = |o: &Operation| o.name.starts_with("img_backbone.");
-    let deformed = |o: &Operation| matches!(o.op, Op::DeformConv { .. });
+    let deformed = |o: &Operation| matches!(o.op, Op::DeformConv(_));
     let offsets = |o: &Operation| o.name.ends_with("conv_offset");
     let pyramid = |o: &Operation| o.name.starts_with("img_neck.");
     assert_near(work(&graph, |o| backbone(o) && side(o) == Some(1)), 645.0, "1x1 of the backbone");
@@ -76,33 +83,35 @@ fn stages_are_those_of_the_golden_cases() {
     let gone = |s: &String| s.starts_with("fpn.") || s.contains(".gather.");
     let left: Vec<String> = expected.iter().filter(|s| !gone(s)).cloned().collect();
     assert_eq!(stages(&full().rewritten(Rewrites::ALL)), left);
-    let inference = Graph::build(&full().network, false);
+    let inference = Graph::build(&full().network, Results::default());
     assert_eq!(inference.stages().filter(|s| s.starts_with("logits.")).collect::<Vec<_>>(), ["logits.lvl0"]);
 }
 
 /// What every graph must be, before and after each rewrite.
 fn assert_sound(graph: &Graph) {
     let mut names = BTreeSet::new();
-    let mut written = BTreeSet::new();
+    let mut written: BTreeSet<TensorId> = BTreeSet::new();
     for (index, operation) in graph.operations.iter().enumerate() {
         let name = &operation.name;
         assert!(names.insert(name), "{name} is there twice");
         for read in operation.reads() {
-            assert!(written.contains(&read), "{name} reads {} before it is written", graph.tensor(read).name);
+            let tensor = graph.tensor(read);
+            let there = written.contains(&read) || tensor.scope == Scope::Input;
+            assert!(there, "{name} reads {} before it is written", tensor.name);
         }
-        let output = graph.tensor(operation.output);
+        let output = graph.tensor(operation.output());
         assert!(operation.first_channel + operation.channels <= output.channels, "{name} writes past its tensor");
-        assert_eq!(output.scope == Scope::Frame, index >= graph.camera_operations, "{name}");
+        assert_eq!(output.lifetime == Lifetime::Frame, index >= graph.camera_operations, "{name}");
         if let Some(id) = operation.in_place().or(operation.residual.map(|r| r.tensor)) {
             let other = graph.tensor(id);
             assert_eq!((other.extent, other.channels), (output.extent, output.channels), "{name}");
         }
-        if let Op::Conv { geometry } | Op::DeformConv { geometry } = operation.op {
+        if let Some(geometry) = geometry(operation) {
             let x = graph.tensor(operation.inputs[0]);
             assert_eq!((geometry.input, geometry.channels), (x.extent, x.channels), "{name}");
             assert_eq!(geometry.output, output.extent, "{name}");
         }
-        written.insert(operation.output);
+        written.extend(&operation.outputs);
     }
 }
 
@@ -111,8 +120,8 @@ fn every_rewrite_leaves_a_sound_graph() {
     for name in crate::network::BUILT_IN {
         let network = Network::built_in(name).expect("built in");
         for coarse in [false, true] {
-            let graph = Graph::build(&network, coarse);
-            let norms = |g: &Graph| g.operations.iter().filter(|o| o.op == Op::BatchNorm).count();
+            let graph = Graph::build(&network, Results { logits: false, coarse_heads: coarse });
+            let norms = |g: &Graph| g.operations.iter().filter(|o| o.op == Op::BatchNorm(BatchNorm)).count();
             assert_sound(&graph);
             assert!(norms(&graph) > 60, "{name}");
             let folded = graph.clone().fold_batch_norm();
@@ -137,7 +146,35 @@ fn work_beyond_64_bits_is_told_as_the_largest() {
         ..full().network
     };
     network.check().expect("within the rules");
-    let graph = Graph::build(&network, true);
+    let graph = Graph::build(&network, Results::ALL);
     let most = graph.operations.iter().map(|o| graph.multiply_adds(o)).max();
     assert_eq!(most, Some(u64::MAX));
+}
+
+#[test]
+fn tensors_know_what_they_are() {
+    let graph = full().rewritten(Rewrites::ALL);
+    let known = |name: &str| {
+        let operation = graph.operations.iter().find(|o| o.name == name).expect(name);
+        let tensor = graph.tensor(operation.result());
+        (tensor.element, tensor.space, tensor.section.to_string(), tensor.scope, tensor.lifetime)
+    };
+    let f32 = |space, section: &str, scope, lifetime| (Element::F32, space, section.to_owned(), scope, lifetime);
+    let inner = |space, section, lifetime| f32(space, section, Scope::Inner, lifetime);
+    let (pass, camera, frame) = (Lifetime::Pass, Lifetime::Camera, Lifetime::Frame);
+    assert_eq!(known("image"), inner(Space::Image, "backbone stem", pass));
+    assert_eq!(known("img_backbone.layer3.0.conv2"), inner(Space::Image, "backbone layer3", pass));
+    assert_eq!(known("img_neck.fpn_convs.1.conv.projected"), inner(Space::Image, "pyramid", camera));
+    let level = "view_transformer.imvts.1";
+    assert_eq!(known(&format!("{level}.gather.volume")), inner(Space::Volume, "level 2 gather", frame));
+    assert_eq!(known(&format!("{level}.down_conv3d.3")), inner(Space::Volume, "level 2 volume", frame));
+    assert_eq!(known(&format!("{level}.bev_attn_layer.mixer.m.attn")), inner(Space::Plane, "level 2 bev", frame));
+    assert_eq!(known("view_transformer.up_sample3.0"), inner(Space::Volume, "up_sample3", frame));
+    assert_eq!(known("view_transformer.refine_lvl0.0"), inner(Space::Volume, "refine_lvl0", frame));
+    assert_eq!(known("occ_head.mlp_occ_lvl1"), inner(Space::Volume, "head", frame));
+    assert_eq!(known("occ_head.mlp_occ_lvl0"), f32(Space::Volume, "head", Scope::Output, frame));
+    let inputs: Vec<&Tensor> = graph.tensors.iter().filter(|t| t.scope == Scope::Input).collect();
+    assert_eq!((inputs.len(), inputs[0].element, inputs[0].bytes()), (1, Element::U8, 928 * 1600 * 3));
+    let outputs = graph.tensors.iter().filter(|t| t.scope == Scope::Output);
+    assert_eq!(outputs.map(|t| t.bytes()).collect::<Vec<_>>(), [640_000, 640_000 * 17 * 4]);
 }

@@ -1,6 +1,11 @@
 //! From pixels to voxels: gather, both branches of each level, their fusion, and the coarse-to-fine refinement.
 
-use super::{After, Builder, ConvNames, ConvShape, Matrix, Op, Recipe, Residual, TensorId};
+use super::builder::{After, Builder, ConvShape};
+use super::matrices::Matrix;
+use super::ops::{BatchNorm, Broadcast, Conv, Deconv, Depthwise, Gate, Gather, GlobalMean, WindowAttention};
+use super::recipe::{ConvNames, Recipe};
+use super::site::Residual;
+use super::tensor::{Branch, Section, Space, TensorId};
 use crate::network::{HEADS, Network};
 use voxcast_kernels::window_attention::Shape;
 
@@ -20,8 +25,9 @@ pub(super) fn build(b: &mut Builder, network: &Network, features: [TensorId; 3])
 /// Level `level` (1 to 3) doubled, to which the finer level's fused volume is added.
 fn up(b: &mut Builder, network: &Network, level: usize, x: TensorId, fused: Option<TensorId>) -> TensorId {
     let prefix = format!("view_transformer.up_sample{level}.0");
+    b.section = Section::Upsample(level);
     let extent = b.graph.tensor(x).extent.map(|v| 2 * v);
-    let y = b.push(&prefix, Op::Deconv, &[x], extent, network.channels[level - 1]);
+    let y = b.push(&prefix, Deconv, &[x], (Space::Volume, extent), network.channels[level - 1]);
     b.last().recipe = Recipe::Conv(ConvNames { prefix, bias: true, norm: None });
     let norm = format!("view_transformer.up_sample{level}.1");
     let residual = fused.map(|tensor| Residual { tensor, after: true });
@@ -30,6 +36,7 @@ fn up(b: &mut Builder, network: &Network, level: usize, x: TensorId, fused: Opti
 
 fn refine(b: &mut Builder, network: &Network, level: usize, x: TensorId) -> TensorId {
     let prefix = format!("view_transformer.refine_lvl{level}");
+    b.section = Section::Refine(level);
     let y = b.conv(
         &format!("{prefix}.0"),
         true,
@@ -48,13 +55,16 @@ fn single_scale(b: &mut Builder, network: &Network, level: usize, features: Tens
     let channels = network.channels[level + 1];
     let [x, y, z] = network.grids[level];
 
+    let section = |branch| Section::Level(level + 1, branch);
     let gather = |b: &mut Builder, matrix, name: &str, extent| {
-        let op = Op::Gather { level, matrix, first_channel: 0, bias: false };
+        b.section = section(Branch::Gather);
+        let op = Gather { level, matrix, first_channel: 0 };
         let rows = b.push(&format!("{prefix}.gather.{name}"), op, &[features], extent, network.fpn);
         b.stage(format!("{stage}.gather.{name}"));
         rows
     };
-    let mut volume = gather(b, Matrix::Volume, "volume", [x, y, z]);
+    let mut volume = gather(b, Matrix::Volume, "volume", (Space::Volume, [x, y, z]));
+    b.section = section(Branch::Volume);
     for (i, side) in [1, 3, 3].into_iter().enumerate() {
         let norm = format!("{prefix}.down_conv3d.{}", 3 * i + 1);
         let conv = format!("{prefix}.down_conv3d.{}", 3 * i);
@@ -62,7 +72,8 @@ fn single_scale(b: &mut Builder, network: &Network, level: usize, features: Tens
     }
     b.stage(format!("{stage}.volume"));
 
-    let mut bev = gather(b, Matrix::Bev, "bev", [1, x, y]);
+    let mut bev = gather(b, Matrix::Bev, "bev", (Space::Plane, [1, x, y]));
+    b.section = section(Branch::Bev);
     for (i, side) in [1, 3, 3].into_iter().enumerate() {
         let norm = format!("{prefix}.xy_conv.{}", 3 * i + 1);
         let conv = format!("{prefix}.xy_conv.{}", 3 * i);
@@ -74,7 +85,8 @@ fn single_scale(b: &mut Builder, network: &Network, level: usize, features: Tens
     bev = aspp(b, &format!("{prefix}.aspp_xy"), bev);
     b.stage(format!("{stage}.aspp"));
 
-    let fused = b.push(&format!("{prefix}.combine_coeff"), Op::Gate, &[volume, bev], [x, y, z], channels);
+    b.section = section(Branch::Volume);
+    let fused = b.push_like(&format!("{prefix}.combine_coeff"), Gate, &[volume, bev], volume);
     b.last().recipe = Recipe::Conv(ConvNames { prefix: format!("{prefix}.combine_coeff"), bias: true, norm: None });
     b.stage(format!("{stage}.fused"));
     fused
@@ -88,17 +100,15 @@ fn efficient_vit(b: &mut Builder, network: &Network, level: usize, prefix: &str,
     let attention = format!("{prefix}.mixer.m.attn");
     let (extent, channels) = (b.graph.tensor(x).extent, b.graph.tensor(x).channels);
     let shape = Shape { extent: [extent[1], extent[2]], channels, heads: HEADS, key_dim: network.key_dims[level] };
-    let op = Op::WindowAttention { shape };
-    let y = b.push(&attention, op, &[x], extent, channels);
-    b.last().recipe = Recipe::Attention(attention);
+    let y = b.push_like(&attention, WindowAttention { shape }, &[x], x);
+    b.last().recipe = Recipe::Module(attention);
     let y = depthwise(b, &format!("{prefix}.dw1.m"), y);
     feed_forward(b, &format!("{prefix}.ffn1.m"), y)
 }
 
 fn depthwise(b: &mut Builder, prefix: &str, x: TensorId) -> TensorId {
-    let (extent, channels) = (b.graph.tensor(x).extent, b.graph.tensor(x).channels);
     let conv = format!("{prefix}.c");
-    let y = b.push(&conv, Op::Depthwise { side: 3 }, &[x], extent, channels);
+    let y = b.push_like(&conv, Depthwise { side: 3 }, &[x], x);
     b.last().recipe = Recipe::Conv(ConvNames { prefix: conv, bias: false, norm: None });
     b.after(y, After::norm(&format!("{prefix}.bn")).add(x))
 }
@@ -120,21 +130,21 @@ fn aspp(b: &mut Builder, prefix: &str, x: TensorId) -> TensorId {
     let inner =
         b.conv(&format!("{prefix}.input_conv.0"), false, x, one, After::norm_relu(&format!("{prefix}.input_conv.1")));
 
-    let wide = b.tensor(&format!("{prefix}.aspp.convs"), extent, 6 * half);
+    let wide = b.tensor(&format!("{prefix}.aspp.convs"), Space::Plane, extent, 6 * half);
     for (i, (side, rate)) in [(1, 1), (3, 1), (3, 6), (3, 12), (3, 18)].into_iter().enumerate() {
         let name = format!("{prefix}.aspp.convs.{i}.0");
         let geometry = ConvShape::plane(side, rate, half).geometry(b.graph.tensor(inner));
-        b.push_into(&name, Op::Conv { geometry }, &[inner], wide, i * half, half);
+        b.push_into(&name, Conv { geometry }, &[inner], &[wide], i * half, half);
         b.last().recipe = Recipe::Conv(ConvNames { prefix: name, bias: false, norm: None });
         let norm = format!("{prefix}.aspp.convs.{i}.1");
-        b.push_into(&norm, Op::BatchNorm, &[wide], wide, i * half, half);
-        b.last().recipe = Recipe::BatchNorm(norm);
+        b.push_into(&norm, BatchNorm, &[wide], &[wide], i * half, half);
+        b.last().recipe = Recipe::Module(norm);
         b.last().relu = true;
     }
-    let mean = b.push(&format!("{prefix}.aspp.convs.5.0"), Op::GlobalMean, &[inner], [1; 3], half);
+    let mean = b.push(&format!("{prefix}.aspp.convs.5.0"), GlobalMean, &[inner], (Space::Plane, [1; 3]), half);
     let pooled =
         b.conv(&format!("{prefix}.aspp.convs.5.1"), false, mean, one, After { relu: true, ..After::default() });
-    b.push_into(&format!("{prefix}.aspp.broadcast"), Op::Broadcast, &[pooled], wide, 5 * half, half);
+    b.push_into(&format!("{prefix}.aspp.broadcast"), Broadcast, &[pooled], &[wide], 5 * half, half);
 
     let y = b.conv(
         &format!("{prefix}.aspp.project.0"),
@@ -144,7 +154,7 @@ fn aspp(b: &mut Builder, prefix: &str, x: TensorId) -> TensorId {
         After::norm_relu(&format!("{prefix}.aspp.project.1")),
     );
     let norm = format!("{prefix}.out_conv.1");
-    // SPEC: the rectifier of `out` comes before the sum with x.
+    // The ReLU of `out` comes before the sum with x.
     let after = After { residual: Some(Residual { tensor: x, after: true }), ..After::norm_relu(&norm) };
     b.conv(&format!("{prefix}.out_conv.0"), false, y, ConvShape::plane(1, 1, channels), after)
 }

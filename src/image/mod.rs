@@ -1,5 +1,8 @@
 //! A camera's image as the caller holds it.
 
+#[cfg(feature = "images")]
+pub(crate) mod png;
+
 use crate::base::error::{Error, Result};
 
 /// The order of a pixel's three bytes.

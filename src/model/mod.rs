@@ -6,20 +6,18 @@
 #[cfg(feature = "import")]
 pub mod checkpoint;
 pub mod import;
-pub mod parts;
 pub mod seeded;
+pub mod selftest;
 
 use crate::base::error::{Error, ErrorKind, Result};
-use crate::check::selftest::{self, SelfTest};
 use crate::file::container::{Container, Data, Layout, Tensor};
-use crate::graph::{Graph, Operation, Rewrites};
-use crate::model::parts::{Part, Precision, parts};
+use crate::graph::parts::{Part, Precision};
+use crate::graph::{Element, Elements, Graph, Operation, Results, Rewrites};
+use crate::model::selftest::SelfTest;
 use crate::network::Network;
-use half::f16;
 use safetensors::Dtype;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
-use voxcast_kernels::Panels;
 
 /// Value of the metadata key `format`.
 pub const FORMAT: &str = "voxcast-model-1";
@@ -120,24 +118,23 @@ impl Model {
         let Some((dtype, shape, _)) = self.container.tensor(name) else {
             return Err(Error::format(format!("tensor \"{name}\" is missing")));
         };
-        let expected = (dtype_of(part, precision), part.stored_len(precision));
+        let expected = (Dtype::from(part.element(precision)), part.stored_len(precision));
         if dtype != expected.0 || shape != [expected.1] {
             return Err(Error::format(format!(
                 "tensor \"{name}\": found {dtype:?} of shape {shape:?}, expected {:?} of shape [{}]",
                 expected.0, expected.1
             )));
         }
-        match part.width(precision) {
-            2 => self.slice::<f16>(name, part.len).map(drop),
-            _ => self.slice::<f32>(name, part.len).map(drop),
-        }
+        self.bytes(name, part).map(drop)
     }
 
-    fn slice<T: bytemuck::Pod>(&self, name: &str, len: usize) -> Result<&[T]> {
+    /// The bytes of a stored part, without the padding after it.
+    fn bytes(&self, name: &str, part: &Part) -> Result<&[u8]> {
+        let size = part.element(self.options.precision).bytes();
         let bytes = self.container.tensor(name).map(|(_, _, bytes)| bytes);
         bytes
-            .and_then(|bytes| bytemuck::try_cast_slice(bytes).ok())
-            .and_then(|numbers: &[T]| numbers.get(..len))
+            .filter(|bytes| (bytes.as_ptr() as usize).is_multiple_of(size))
+            .and_then(|bytes| bytes.get(..part.len * size))
             .ok_or_else(|| Error::format(format!("tensor \"{name}\" is missing, short or not aligned")))
     }
 
@@ -204,13 +201,13 @@ impl Model {
     }
 
     /// The graph that runs: every rewrite the model has weights for, or, with `unfolded`, without the projection fold.
-    pub fn graph(&self, unfolded: bool, coarse_heads: bool) -> Graph {
+    pub fn graph(&self, unfolded: bool, results: Results) -> Graph {
         let rewrites = self.options.rewrites;
-        Graph::build(&self.network, coarse_heads)
+        Graph::build(&self.network, results)
             .rewritten(Rewrites { projection: rewrites.projection && !unfolded, ..rewrites })
     }
 
-    /// Where the stored parts of `operation` lie, in the order of [`parts`].
+    /// Where the stored parts of `operation` lie, in the order of its description.
     ///
     /// # Errors
     /// None for operations of this model's graphs: [`Model::open`] has seen all of them.
@@ -221,18 +218,16 @@ impl Model {
             .map(|part| {
                 let name = format!("{}.{}", operation.name, part.suffix);
                 self.check(&name, part)?;
-                let bytes = self.container.tensor(&name).map_or(&[][..], |(_, _, bytes)| bytes);
+                let bytes = self.bytes(&name, part)?;
                 let start = bytes.as_ptr() as usize - data.as_ptr() as usize;
-                let width = part.width(self.options.precision);
-                Ok(PartRef { bytes: start..start + part.len * width, half: width == 2 })
+                Ok(PartRef { bytes: start..start + bytes.len(), element: part.element(self.options.precision) })
             })
             .collect()
     }
 
-    /// The numbers of a part that [`Model::part_refs`] found. Costs nothing and allocates nothing.
-    pub(crate) fn resolve(&self, part: &PartRef) -> Panels<'_> {
-        let bytes = &self.container.bytes()[part.bytes.clone()];
-        if part.half { Panels::F16(bytemuck::cast_slice(bytes)) } else { Panels::F32(bytemuck::cast_slice(bytes)) }
+    /// The elements of a part that [`Model::part_refs`] found. Costs nothing and allocates nothing.
+    pub(crate) fn resolve(&self, part: &PartRef) -> Elements<'_> {
+        Elements::new(part.element, &self.container.bytes()[part.bytes.clone()])
     }
 }
 
@@ -240,18 +235,19 @@ impl Model {
 #[derive(Clone, Debug)]
 pub(crate) struct PartRef {
     bytes: std::ops::Range<usize>,
-    half: bool,
+    element: Element,
 }
 
-fn dtype_of(part: &Part, precision: Precision) -> Dtype {
-    if part.width(precision) == 2 { Dtype::F16 } else { Dtype::F32 }
+/// What `operation` stores.
+pub(crate) fn parts(graph: &Graph, operation: &Operation) -> Vec<Part> {
+    operation.op.description().parts(&graph.site(operation))
 }
 
 /// The graphs that a model of these rewrites can run, the fastest first.
 pub(crate) fn graphs(network: &Network, rewrites: Rewrites) -> Vec<Graph> {
-    let mut graphs = vec![Graph::build(network, true).rewritten(rewrites)];
+    let mut graphs = vec![Graph::build(network, Results::ALL).rewritten(rewrites)];
     if rewrites.projection {
-        graphs.push(Graph::build(network, true).rewritten(Rewrites { projection: false, ..rewrites }));
+        graphs.push(Graph::build(network, Results::ALL).rewritten(Rewrites { projection: false, ..rewrites }));
     }
     graphs
 }
@@ -270,7 +266,7 @@ pub(crate) fn stored_parts(network: &Network, rewrites: Rewrites) -> Vec<(String
 
 /// A stored tensor, to be written.
 pub(crate) fn tensor<'a>(name: String, part: &Part, precision: Precision, data: Data<'a>) -> Tensor<'a> {
-    Tensor { name, dtype: dtype_of(part, precision), shape: vec![part.stored_len(precision)], data }
+    Tensor { name, dtype: Dtype::from(part.element(precision)), shape: vec![part.stored_len(precision)], data }
 }
 
 /// Writes the bytes of a model, such as one built into a program, to `path`, by way of a temporary file beside it.

@@ -2,21 +2,15 @@
 
 use super::*;
 use crate::file::container;
+use crate::graph::Recipe;
+use crate::graph::parts::MAX_PARTS;
 use crate::model::import::import;
 use crate::model::seeded::SeededWeights;
+use crate::small;
 use std::sync::OnceLock;
 
 fn network() -> Network {
-    Network {
-        depths: [1; 4],
-        width: 2,
-        fpn: 4,
-        channels: [3, 8, 8, 8],
-        key_dims: [1; 3],
-        image: [32, 32],
-        grids: [[8, 4, 4], [4, 2, 2], [2, 1, 1]],
-        ..Network::built_in("nuscenes-200").expect("built in")
-    }
+    Network { image: [32, 32], ..small::tiny() }
 }
 
 fn sound(options: Options) -> Vec<u8> {
@@ -99,13 +93,15 @@ fn models_say_what_they_are() {
             let expected = stored_parts(&network(), rewrites).into_iter().map(|(name, _)| name);
             assert!(stored.into_iter().eq(expected), "in this order");
             for unfolded in [false, true] {
-                let graph = model.graph(unfolded, true);
+                let graph = model.graph(unfolded, Results::ALL);
                 for operation in &graph.operations {
                     let refs = model.part_refs(&graph, operation).expect("all are there");
                     let parts = parts(&graph, operation);
                     assert_eq!(refs.len(), parts.len());
                     for (found, part) in refs.iter().zip(&parts) {
-                        assert_eq!(model.resolve(found).len(), part.len, "{}", operation.name);
+                        let elements = model.resolve(found);
+                        assert_eq!(elements.len(), part.len, "{}", operation.name);
+                        assert_eq!(elements.element(), part.element(precision), "{}", operation.name);
                     }
                 }
             }
@@ -133,7 +129,7 @@ fn metadata_that_is_wrong_is_named() {
         |_, m| drop(m.insert("network".into(), deeper)),
         "tensor \"img_backbone.layer1.1.conv1.weight\" is missing",
     );
-    let wider = Network { fpn: 5, ..network() }.to_json();
+    let wider = Network { fpn: 6, ..network() }.to_json();
     refused(|_, m| drop(m.insert("network".into(), wider)), "img_neck.");
     refused(set("precision", "f16"), "expected F16 of shape");
 }
@@ -154,4 +150,40 @@ fn tensors_that_are_wrong_are_named() {
     // A tensor of the right size that starts between two numbers.
     refused(|t, _| t.insert(0, ("pad".into(), Dtype::U8, 2, vec![0; 2])), "not aligned");
     assert!(Model::from_bytes(edited(|t, _| t.push(("more".into(), Dtype::U8, 1, vec![0])))).is_ok());
+}
+
+#[test]
+fn no_operation_has_more_parts_than_a_session_has_room_for() {
+    for name in crate::network::BUILT_IN {
+        let network = Network::built_in(name).expect("built in");
+        for rewrites in [Rewrites::ALL, Rewrites::NONE] {
+            let graph = Graph::build(&network, Results::ALL).rewritten(rewrites);
+            let counts: Vec<usize> = graph.operations.iter().map(|o| parts(&graph, o).len()).collect();
+            assert_eq!(counts.iter().max(), Some(&MAX_PARTS));
+            for operation in &graph.operations {
+                let parts = parts(&graph, operation);
+                assert_eq!(parts.is_empty(), operation.recipe == Recipe::None, "{}", operation.name);
+                assert!(parts.iter().all(|p| p.len > 0), "{}", operation.name);
+            }
+        }
+    }
+}
+
+#[test]
+fn stored_sizes_of_known_operations() {
+    let network = Network::built_in("nuscenes-200").expect("built in");
+    let graph = Graph::build(&network, Results::default()).rewritten(Rewrites::ALL);
+    let lens = |name: &str| {
+        let operation = graph.operations.iter().find(|o| o.name == name).expect(name);
+        parts(&graph, operation).iter().map(|p| p.len).collect::<Vec<_>>()
+    };
+    assert_eq!(lens("img_backbone.conv1"), [7 * 7 * 3 * 64, 64]);
+    // 27 offsets and mask logits fill two panels of 16.
+    assert_eq!(lens("img_backbone.layer3.0.conv2.conv_offset"), [9 * 256 * 32, 32]);
+    // 64 channels for the volume and 64 for the plane.
+    assert_eq!(lens("img_neck.fpn_convs.0.conv.projected"), [9 * 512 * 128, 128]);
+    assert_eq!(lens("view_transformer.up_sample1.0"), [8 * 8 * 64 * 32, 32]);
+    assert_eq!(lens("view_transformer.imvts.0.combine_coeff"), [64, 16]);
+    // 17 classes fill two panels.
+    assert_eq!(lens("occ_head.mlp_occ_lvl0"), [32 * 32, 32, 32 * 32, 32, 32 * 32, 32]);
 }

@@ -2,6 +2,10 @@
 //!
 //! The keys are those of a `network.json`. [`crate::graph`] turns these numbers into operations.
 
+mod grid;
+
+pub use grid::{Axes, Grid, forward_of};
+
 use crate::base::error::{Error, Result};
 use serde::{Deserialize, Serialize};
 
@@ -97,8 +101,8 @@ const MAX_DIM: usize = 1 << 16;
 /// block, and planning looks at pairs of them.
 const MAX_DEPTH: usize = 256;
 
-/// Pixels that a side of the padded image may have: what a scene's images may have.
-const MAX_SIDE: usize = crate::scene::MAX_SIDE;
+/// Pixels that a side of an image may have, padded or not.
+pub const MAX_SIDE: usize = 16_384;
 
 /// Voxels that the output may have. `nuscenes-256` has 2^21.
 const MAX_VOXELS: u64 = 1 << 32;

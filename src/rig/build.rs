@@ -14,9 +14,9 @@
 //! A slab's rows depend on nothing but the calibration, and slabs are joined by position: the number of threads cannot
 //! show in the result.
 
-use super::axis::axis;
+use super::frustum::Frustum;
+use super::level::{LevelGrid, range};
 use super::rows::{Growing, PixelSet, out_of_memory, too_many_entries};
-use super::view::View;
 use super::{Rig, Storage, Tensors};
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::base::threads::Threads;
@@ -24,8 +24,8 @@ use crate::network::Network;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use voxcast_kernels::project::project_points;
 use voxcast_kernels::{Isa, LANES};
+use voxcast_kernels::project::project_points;
 
 /// Rows of one matrix. A gibibyte of row pointers; `nuscenes-256` has 2^18.
 const MAX_ROWS: u128 = 1 << 28;
@@ -65,10 +65,10 @@ const SLABS: usize = 128;
 /// # Ok::<(), voxcast::Error>(())
 /// ```
 pub struct RigBuilder {
-    levels: [Level; 3],
+    levels: [LevelGrid; 3],
     slabs: Vec<Mutex<Slab>>,
     /// The cameras of the last build, per level.
-    views: [Vec<View>; 3],
+    views: [Vec<Frustum>; 3],
     /// One per thread.
     scratch: Vec<Mutex<Scratch>>,
     threads: Threads,
@@ -82,34 +82,17 @@ pub struct RigBuilder {
     done: Option<usize>,
 }
 
-/// What is fixed about a level.
-pub(super) struct Level {
-    grid: [usize; 3],
-    /// Sample points per voxel and axis.
-    samples: usize,
-    /// Sample coordinates along x, y and z; z padded to a multiple of [`LANES`], which the kernel
-    /// takes at once, with NaN, which hits nothing.
-    axes: [Vec<f32>; 3],
-    /// Smallest and largest z coordinate.
-    z_range: [f64; 2],
-    /// Height and width of the padded image.
-    pub(super) image: [usize; 2],
-    pub(super) stride_log2: u32,
-    /// Feature pixels of one camera.
-    pub(super) pixels: usize,
-}
-
 /// Some columns of a level and their rows.
 struct Slab {
     level: usize,
     columns: std::ops::Range<usize>,
-    volume: Rows,
-    bev: Rows,
+    volume: MatrixRows,
+    bev: MatrixRows,
 }
 
 /// Consecutive rows of a matrix.
 #[derive(Default)]
-struct Rows {
+struct MatrixRows {
     /// Where each row ends in `col`.
     ends: Vec<u32>,
     col: Vec<u32>,
@@ -141,14 +124,14 @@ impl RigBuilder {
         for l in 0..3 {
             check_size(network, l, cameras)?;
         }
-        let levels = [0, 1, 2].map(|l| Level::new(network, l));
+        let levels = [0, 1, 2].map(|l| LevelGrid::new(network, l));
         let mut slabs = Vec::new();
         for (l, level) in levels.iter().enumerate() {
             let columns = level.grid[0] * level.grid[1];
             let step = columns.div_ceil(SLABS);
             slabs.extend((0..columns).step_by(step).map(|from| {
                 let columns = from..columns.min(from + step);
-                Mutex::new(Slab { level: l, columns, volume: Rows::default(), bev: Rows::default() })
+                Mutex::new(Slab { level: l, columns, volume: MatrixRows::default(), bev: MatrixRows::default() })
             }));
         }
         Ok(Self {
@@ -222,7 +205,7 @@ impl RigBuilder {
         }
         for (level, views) in self.levels.iter().zip(&mut self.views) {
             views.clear();
-            views.extend(lidar2img.iter().enumerate().map(|(c, m)| View::new(level, self.cameras, c, m)));
+            views.extend(lidar2img.iter().enumerate().map(|(c, m)| Frustum::new(level, self.cameras, c, m)));
         }
         self.entries = Default::default();
         self.done = Some(0);
@@ -351,37 +334,8 @@ fn check_size(network: &Network, level: usize, cameras: usize) -> Result<()> {
     Ok(())
 }
 
-impl Level {
-    pub(super) fn new(network: &Network, level: usize) -> Self {
-        let (grid, samples) = (network.grids[level], network.samples[level]);
-        let mut axes = [0, 1, 2].map(|a| axis(network.sampling, network.bounds[a], grid[a] * samples));
-        let z_range = range(&axes[2]);
-        let padded = axes[2].len().next_multiple_of(LANES);
-        axes[2].resize(padded, f32::NAN);
-        Self {
-            grid,
-            samples,
-            axes,
-            z_range,
-            image: network.image,
-            stride_log2: network.strides[level].ilog2(),
-            pixels: network.feature_pixels(level),
-        }
-    }
-
-    /// Sample points of a column in one camera, padding included.
-    fn points(&self) -> usize {
-        self.samples * self.samples * self.axes[2].len()
-    }
-}
-
-/// Smallest and largest of `values`.
-fn range(values: &[f32]) -> [f64; 2] {
-    values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |[lo, hi], &v| [lo.min(v.into()), hi.max(v.into())])
-}
-
 impl Slab {
-    fn fill(&mut self, level: &Level, views: &[View], scratch: &mut Scratch, isa: Isa) -> Result<()> {
+    fn fill(&mut self, level: &LevelGrid, views: &[Frustum], scratch: &mut Scratch, isa: Isa) -> Result<()> {
         let [_, grid_y, grid_z] = level.grid;
         let n = level.samples;
         let (points, line) = (level.points(), level.axes[2].len());
@@ -411,7 +365,7 @@ impl Slab {
     }
 }
 
-impl Rows {
+impl MatrixRows {
     /// Becomes the rows of `other`, with no more memory than they need.
     fn copy(&mut self, other: &Growing) -> Result<()> {
         for (to, from) in [(&mut self.ends, &other.ends[..]), (&mut self.col, &other.col[..other.used])] {

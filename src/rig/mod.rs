@@ -5,33 +5,17 @@
 mod axis;
 mod build;
 mod file;
+mod frustum;
+mod level;
 mod rows;
 #[cfg(test)]
 mod tests;
-mod view;
 
+pub use crate::graph::{Csr, Level};
 pub use build::RigBuilder;
 
 use crate::file::container::Container;
 use std::ops::Range;
-
-/// A 0/1 matrix in compressed sparse rows: row `r` holds the columns `col[ptr[r]..ptr[r + 1]]`, strictly ascending.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Csr<'a> {
-    /// `rows + 1` offsets into `col`, starting at 0, never descending, ending at `col.len()`.
-    pub ptr: &'a [u32],
-    /// Flat pixel index `camera * H * W + v * W + u` of each entry.
-    pub col: &'a [u32],
-}
-
-/// The matrices of one level.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Level<'a> {
-    /// Rows `(x * Y + y) * Z + z`.
-    pub volume: Csr<'a>,
-    /// Rows `x * Y + y`: the union of the rows of that column's voxels.
-    pub bev: Csr<'a>,
-}
 
 /// Per level: volume ptr and col, then BEV ptr and col.
 type Tensors<T> = [[T; 4]; 3];

@@ -2,6 +2,5 @@
 
 pub(crate) mod arena;
 pub(crate) mod executor;
-pub(crate) mod heap;
 pub mod plan;
 pub mod session;

@@ -14,19 +14,18 @@ pub use output::Occupancy;
 
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::base::threads::Threads;
-use crate::graph::{Graph, Operation};
+use crate::graph::{Elements, Graph, Operation};
 use crate::image::ImageView;
 use crate::model::{Model, PartRef};
 use crate::network::Network;
 use crate::rig::{Csr, Level, Rig};
 use crate::runtime::arena::Arena;
 use crate::runtime::executor::Executor;
-use crate::runtime::heap;
-use crate::runtime::plan::Plan;
+use crate::runtime::plan::{Plan, Region};
 use crate::scene::Scene;
-use camera::Camera;
+use camera::CameraState;
 use frame::Frame;
-use memory::{Lengths, Tables};
+use memory::Tables;
 use output::{Output, zeros};
 use std::sync::Arc;
 use std::time::Duration;
@@ -74,8 +73,8 @@ pub struct Event<'a> {
     pub elapsed: Duration,
     /// Wall time of the longest slice.
     pub longest: Duration,
-    /// What it wrote: the tensor, or a head's logits.
-    pub output: &'a [f32],
+    /// What it wrote; of a head the logits, or the classes where the session has no logits.
+    pub output: Elements<'a>,
 }
 
 /// A model with memory to run in. Nothing is allocated after [`Session::new`].
@@ -90,19 +89,19 @@ pub struct Session {
     /// For each operation, where its weights lie in the model.
     weights: Vec<Vec<PartRef>>,
     arena: Arena,
-    keep_logits: bool,
+    /// The latest image of every camera.
+    images: Arena,
     slice_cost: u64,
-    cameras: Vec<Camera>,
+    cameras: Vec<CameraState>,
     /// Cameras that are left out.
     masked: Vec<bool>,
     /// Counts the changes of rig and mask.
-    sight: u64,
+    visibility: u64,
     frame: Frame,
     /// The last complete result.
     front: Output,
     /// The result that is being written.
     back: Output,
-    coarse_classes: Vec<u8>,
 }
 
 impl std::fmt::Debug for Session {
@@ -118,8 +117,7 @@ impl Session {
     /// # Errors
     /// [`ErrorKind::TooLarge`] if it cannot be addressed.
     pub fn memory(model: &Model, cameras: usize, options: &SessionOptions) -> Result<Memory> {
-        let tables = Tables::new(model, cameras, options)?;
-        Lengths::new(&tables.graph, options).memory(&tables, cameras)
+        Tables::new(model, cameras, options)?.memory(cameras)
     }
 
     /// Plans and allocates. The rig may be swapped later.
@@ -130,32 +128,27 @@ impl Session {
         let count = rig.cameras();
         check_rig(&rig, model.network(), count)?;
         let tables = Tables::new(&model, count, options)?;
-        let lengths = Lengths::new(&tables.graph, options);
-        let Memory { arena: bytes, .. } = lengths.memory(&tables, count)?;
+        let Memory { arena: bytes, .. } = tables.memory(count)?;
         let Tables { graph, plan, weights } = tables;
         let no_arena =
             || Error::new(ErrorKind::TooLarge, format!("the system has no {bytes} bytes for the session's arena"));
         let no_memory =
             || Error::new(ErrorKind::TooLarge, "the system has no memory for the session's images and results");
-        let arena = Arena::new(plan.len()).ok_or_else(no_arena)?;
-        let mut cameras = Vec::new();
-        cameras.try_reserve_exact(count).map_err(|_| no_memory())?;
-        for _ in 0..count {
-            cameras.push(Camera::new(zeros(lengths.image).ok_or_else(no_memory)?));
-        }
-        let output = || Output::new(lengths.voxels, lengths.logits, count).ok_or_else(no_memory);
+        let arena = Arena::new(plan.bytes(Region::Arena)).ok_or_else(no_arena)?;
+        let images = Arena::new(plan.bytes(Region::Input)).ok_or_else(no_memory)?;
+        let output = || Output::new(&graph, &plan, count).ok_or_else(no_memory);
+        let (front, back) = (output()?, output()?);
         let session = Self {
             arena,
+            images,
             executor: Executor { isa: options.isa, graph, plan, cameras: count, threads: options.threads.clone() },
-            keep_logits: options.logits,
             slice_cost: options.slice_cost.max(1),
             masked: zeros(count).ok_or_else(no_memory)?,
-            sight: 1,
+            visibility: 1,
             frame: Frame::default(),
-            front: output()?,
-            back: output()?,
-            coarse_classes: zeros(lengths.coarse).ok_or_else(no_memory)?,
-            cameras,
+            front,
+            back,
+            cameras: zeros(count).ok_or_else(no_memory)?,
             weights,
             model,
             rig,
@@ -181,24 +174,20 @@ impl Session {
 
     /// What the session took, as [`Session::memory`] said it would.
     pub fn taken(&self) -> Memory {
-        let weights: usize = self.weights.iter().map(heap::vector).sum();
         Memory {
-            arena: self.arena.bytes(),
-            images: heap::vector(&self.cameras)
-                + heap::vector(&self.masked)
-                + self.cameras.iter().map(Camera::bytes).sum::<usize>(),
-            output: self.front.bytes() + self.back.bytes() + heap::vector(&self.coarse_classes),
-            tables: heap::graph(&self.executor.graph)
-                + self.executor.plan.heap_bytes()
-                + heap::vector(&self.weights)
-                + weights,
+            arena: self.arena.len(),
+            images: self.images.len()
+                + self.cameras.capacity() * size_of::<CameraState>()
+                + self.masked.capacity() * size_of::<bool>(),
+            output: self.front.bytes() + self.back.bytes(),
+            tables: memory::tables(&self.executor.graph, &self.executor.plan, &self.weights),
         }
     }
 
     /// Whether results have logits.
     #[cfg(feature = "capi")]
     pub(crate) fn keeps_logits(&self) -> bool {
-        self.keep_logits
+        self.front.has_logits()
     }
 
     /// Cameras of a frame.
@@ -217,7 +206,7 @@ impl Session {
     pub fn set_rig(&mut self, rig: Arc<Rig>) -> Result<Arc<Rig>> {
         check_rig(&rig, self.model.network(), self.cameras.len())?;
         let replaced = std::mem::replace(&mut self.rig, rig);
-        self.sight_changed();
+        self.visibility_changed();
         Ok(replaced)
     }
 
@@ -232,7 +221,7 @@ impl Session {
         self.check_camera(camera)?;
         if std::mem::replace(&mut self.masked[camera], masked) != masked {
             self.frame.leave(camera, &mut self.cameras[camera]);
-            self.sight_changed();
+            self.visibility_changed();
         }
         Ok(())
     }
@@ -245,7 +234,7 @@ impl Session {
     pub fn set_camera(&mut self, camera: usize, image: ImageView<'_>) -> Result<()> {
         self.check_camera(camera)?;
         image.check(camera, self.model.network().image)?;
-        self.cameras[camera].receive(&image);
+        self.receive(camera, &image);
         self.frame.received(camera);
         Ok(())
     }
@@ -269,10 +258,8 @@ impl Session {
 
     /// The last complete result; none before the first frame. It stays as it is while [`Session::step`] works on the next.
     pub fn occupancy(&self) -> Option<Occupancy<'_>> {
-        let Output { classes, logits, support, cameras, .. } = &self.front;
-        let logits = self.keep_logits.then_some(&logits[..]);
         let grid = self.model.network().output_grid();
-        self.frame.any_complete().then_some(Occupancy { grid, classes, logits, support, cameras })
+        self.frame.any_complete().then(|| self.front.occupancy(grid))
     }
 
     /// The longest time that one slice took so far, and the operation that it was a part of. Slices of [`Session::run`]
@@ -327,12 +314,20 @@ impl Session {
             image.check(camera, self.model.network().image)?;
         }
         self.frame.restart(&mut self.cameras);
-        for (camera, image) in self.cameras.iter_mut().zip(images) {
-            camera.receive(&image);
+        for (camera, image) in images.enumerate() {
+            self.receive(camera, &image);
         }
         let step = self.step_observed(Budget::Unlimited, observer);
         debug_assert_eq!(step, Step::Complete, "every camera has a new image");
         Ok(self.occupancy().expect("a complete frame"))
+    }
+
+    /// Copies an image, which was checked, to its camera's tensor.
+    fn receive(&mut self, camera: usize, image: &ImageView<'_>) {
+        let place = self.executor.place(self.executor.graph.operations[0].inputs[0], Some(camera));
+        let len = image.height * image.width * 3;
+        image.copy_to(&mut self.images.bytes_mut()[place.bytes][..len]);
+        self.cameras[camera].receive([image.height, image.width]);
     }
 
     fn check_camera(&self, camera: usize) -> Result<()> {
@@ -342,9 +337,9 @@ impl Session {
         Ok(())
     }
 
-    fn sight_changed(&mut self) {
-        self.sight += 1;
-        self.frame.sight_changed();
+    fn visibility_changed(&mut self) {
+        self.visibility += 1;
+        self.frame.visibility_changed();
     }
 }
 

@@ -2,6 +2,8 @@
 
 pub mod camera;
 
+pub use crate::network::{MAX_SIDE, forward_of};
+
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::network::Network;
 use crate::scene::camera::read_calibration;
@@ -12,9 +14,6 @@ use std::path::{Component, Path};
 
 /// Cameras that a scene may have.
 pub const MAX_CAMERAS: usize = 64;
-
-/// Longest side of an image in pixels.
-pub const MAX_SIDE: usize = 16_384;
 
 /// Largest `calibration.json` in bytes; one with 64 cameras needs a hundredth of it.
 const MAX_CALIBRATION: u64 = 8 << 20;
@@ -30,17 +29,6 @@ const MAX_PIXELS_PER_BYTE: u64 = 8 * 1032;
 /// that wants to say one thing only gives its hook an exception for this name.
 #[cfg(feature = "images")]
 pub const DECODER_THREAD: &str = "voxcast image decoder";
-
-/// The ego vehicle's forward direction in the lidar frame, as (x, y), judged by the bounds of the grid.
-///
-/// A grid that starts at x = 0 and is symmetric in y lies ahead of a vehicle that drives along +x (SemanticKITTI). Any other
-/// is taken to lie around a vehicle that drives along +y, as nuScenes mounts its lidar. `bounds` are [min, max] metres of
-/// x, y and z.
-pub fn forward_of(bounds: &[[f32; 2]; 3]) -> [f32; 2] {
-    let [x, y] = [bounds[0], bounds[1]];
-    let slack = 1e-3 * (y[1] - y[0]).abs();
-    if x[0].abs() <= slack && x[1] > slack && (y[0] + y[1]).abs() <= slack { [1.0, 0.0] } else { [0.0, 1.0] }
-}
 
 /// One camera image: 8-bit, three channels, rows top to bottom, **BGR** as the published networks were trained.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -191,7 +179,7 @@ impl Scene {
             let path = directory.join(&file);
             let mut rgb = image.bgr.clone();
             rgb.chunks_exact_mut(3).for_each(|p| p.swap(0, 2));
-            crate::show::picture::write_rgb_png(&path, image.width, image.height, &rgb)?;
+            crate::image::png::write_rgb_png(&path, image.width, image.height, &rgb)?;
             let matrix: Vec<&[f32]> = self.lidar2img[index].chunks(4).collect();
             cameras.push(serde_json::json!({
                 "name": name, "file": file, "width": image.width, "height": image.height, "lidar2img": matrix,

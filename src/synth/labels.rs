@@ -2,7 +2,7 @@
 
 use super::camera::Pinhole;
 use super::objects::class;
-use super::render::View;
+use super::render::CameraView;
 use super::solid::Object;
 use super::world::World;
 use crate::network::Network;
@@ -171,7 +171,7 @@ fn fill(world: &World, grid: &Grid, object: &Object, fills: &mut Vec<Fill>) {
 }
 
 /// Per voxel whether a camera sees it: whether the ray of one of its pixels goes through it or ends on it.
-pub(super) fn visible(grid: &Grid, cameras: &[Pinhole], views: &[View]) -> Vec<u8> {
+pub(super) fn visible(grid: &Grid, cameras: &[Pinhole], views: &[CameraView]) -> Vec<u8> {
     let mut seen = vec![0u8; grid.voxels()];
     for (camera, view) in cameras.iter().zip(views) {
         let [height, width] = camera.size;

@@ -18,7 +18,7 @@ mod world;
 #[cfg(all(feature = "images", feature = "npz"))]
 mod write;
 
-pub use render::{SKY, View};
+pub use render::{CameraView, SKY};
 #[cfg(all(feature = "images", feature = "npz"))]
 pub use write::{SET_FORMAT, set_file};
 
@@ -129,7 +129,7 @@ impl Synthesiser {
         let world = World::new(seed, metres(count.saturating_sub(1)), metres(index));
         let light = Light::new(&mut Random::new(seed ^ 0x11f4_7e57_ab1e_0001));
         let noise = |camera: usize| seed.wrapping_mul(0x9e37_79b9) ^ (index as u64) << 32 ^ camera as u64;
-        let views: Vec<View> =
+        let views: Vec<CameraView> =
             self.cameras.iter().enumerate().map(|(n, camera)| world.view(&light, camera, noise(n))).collect();
         let grid = Grid::new(&self.network, self.forward);
         let labels = labels::voxels(&world, &grid);

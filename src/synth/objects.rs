@@ -5,7 +5,7 @@ use super::texture::{Finish, any_colour, hex, pick};
 use crate::base::random::Random;
 use glam::Vec3;
 
-/// Classes of objects, as in SPEC's list for nuScenes.
+/// Classes of objects, numbered as in SurroundOcc's list for nuScenes.
 pub(super) mod class {
     pub(in crate::synth) const BARRIER: u8 = 1;
     pub(in crate::synth) const BICYCLE: u8 = 2;

@@ -45,7 +45,7 @@ pub(super) struct Light {
 
 /// What one camera sees.
 #[derive(Clone, Debug)]
-pub struct View {
+pub struct CameraView {
     /// The image.
     pub image: Image,
     /// Per pixel the class of what it sees; 255 for the sky.
@@ -163,7 +163,7 @@ impl World {
     }
 
     /// What a camera sees. `seed` is of the sensor's noise.
-    pub(super) fn view(&self, light: &Light, camera: &Pinhole, seed: u64) -> View {
+    pub(super) fn view(&self, light: &Light, camera: &Pinhole, seed: u64) -> CameraView {
         let [height, width] = camera.size;
         let origin = self.placed(camera.at.as_vec3());
         let cast = |u: f64, v: f64| {
@@ -202,7 +202,7 @@ impl World {
             let toned = toned.clamp(Vec3::ZERO, Vec3::ONE) * 255.0 + 0.5;
             bgr[3 * pixel..3 * pixel + 3].copy_from_slice(&[toned.z as u8, toned.y as u8, toned.x as u8]);
         }
-        View { image: Image { height, width, bgr }, classes, depths }
+        CameraView { image: Image { height, width, bgr }, classes, depths }
     }
 
     /// The class that the ground has at a point of the world.

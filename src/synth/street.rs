@@ -7,7 +7,7 @@ use super::texture::{fraction, pick, smooth, speckle};
 use crate::base::random::Random;
 use glam::{Vec2, Vec3};
 
-/// Classes of the ground, as in SPEC's list for nuScenes.
+/// Classes of the ground, numbered as in SurroundOcc's list for nuScenes.
 pub(super) mod class {
     pub(in crate::synth) const DRIVEABLE: u8 = 11;
     pub(in crate::synth) const OTHER_FLAT: u8 = 12;

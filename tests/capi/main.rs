@@ -21,20 +21,7 @@ use voxcast::graph::Rewrites;
 use voxcast::import::import;
 use voxcast::model::Options;
 use voxcast::weights::Precision;
-use voxcast::{ImageView, Isa, Model, Network, Session, SessionOptions, Threads, selftest};
-
-/// A network that is small enough for valgrind.
-fn network() -> Network {
-    Network {
-        image: [32, 64],
-        grids: [[4, 8, 4], [2, 4, 2], [1, 2, 1]],
-        depths: [1; 4],
-        fpn: 5,
-        channels: [3, 8, 8, 8],
-        key_dims: [1; 3],
-        ..small::network()
-    }
-}
+use voxcast::{ImageView, Isa, Model, Session, SessionOptions, Threads, selftest};
 
 /// Files for C programs, and the digest that they must find.
 struct Files {
@@ -49,7 +36,7 @@ impl Files {
     fn new() -> Self {
         let directory = tempfile::tempdir().unwrap();
         let path = |name: &str| directory.path().join(name);
-        let network = network();
+        let network = small::tiny();
         let options = Options { precision: Precision::F32, rewrites: Rewrites::ALL };
         import(&small::Weights(1), &network, options, &path("model"), &mut |_, _| ()).unwrap();
         std::fs::copy(path("model"), path("mute")).unwrap();

@@ -218,12 +218,12 @@ fn damaged_scenes() {
     }
     // A sound scene of the wrong size.
     let other = Network { image: [64, 64], ..network() };
-    voxcast::demo::demo_scene(&other, 1).save(&place.path("other")).unwrap();
+    small::scene(&other, 1).save(&place.path("other")).unwrap();
     let line = refused(&place.text("other"), &words(&place.run("model", "rig", "other")));
     assert!(line.contains("64x64") && line.contains("32x64"), "{line}");
     // And of another number of cameras.
     let other = Network { cameras: 1, ..network() };
-    voxcast::demo::demo_scene(&other, 1).save(&place.path("one")).unwrap();
+    small::scene(&other, 1).save(&place.path("one")).unwrap();
     let line = refused(&place.text("rig"), &words(&place.run("model", "rig", "one")));
     assert!(line.contains("2 cameras, expected 1"), "{line}");
 }

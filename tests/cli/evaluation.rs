@@ -83,7 +83,7 @@ fn published_sets_are_scored() {
     let place = Place(tempfile::tempdir().unwrap());
     let network = Network { classes: 17, cameras: 6, ..network() };
     fs::write(place.path("model"), small::model_bytes(&network, Precision::F32, Rewrites::ALL, 3)).unwrap();
-    let scene = voxcast::demo::demo_scene(&network, 1);
+    let scene = small::scene(&network, 1);
     scene.save(&place.path("samples")).unwrap();
     let images: Vec<String> = scene.names.iter().map(|name| format!("samples/{name}.png")).collect();
     write_nuscenes(place.0.path(), &images);

@@ -117,7 +117,7 @@ impl Place {
         let tensors = recorder.0.into_inner();
         fs::write(place.path("weights.pth"), pth_bytes(&tensors)).unwrap();
         fs::write(place.path("weights.safetensors"), plain_bytes(&tensors)).unwrap();
-        voxcast::demo::demo_scene(&network(), 1).save(&place.path("scene")).unwrap();
+        small::scene(&network(), 1).save(&place.path("scene")).unwrap();
         place
     }
 

@@ -17,9 +17,9 @@ pub(crate) enum After {
     #[default]
     Nothing,
     Relu,
-    /// A tensor is added, then the rectifier.
+    /// A tensor is added, then the ReLU.
     AddRelu,
-    /// The rectifier, then a tensor is added.
+    /// The ReLU, then a tensor is added.
     ReluAdd,
 }
 

@@ -10,8 +10,12 @@ use voxcast::rig::RigBuilder;
 use voxcast::weights::Precision;
 use voxcast::{ImageView, Isa, Model, Network, Rig};
 
+#[path = "scene.rs"]
+mod scene;
 #[path = "weights.rs"]
 mod weights;
+#[allow(unused_imports, reason = "other tests use the rest")]
+pub(crate) use scene::{lidar2img, scene};
 pub(crate) use weights::{Tempered, Weights};
 
 /// A network with odd sizes wherever sizes are free: channels that fill no vector, X != Y, windows that need padding.
@@ -35,6 +39,22 @@ pub(crate) fn network() -> Network {
     }
 }
 
+/// As small as a network that runs everything can be.
+pub(crate) fn tiny() -> Network {
+    Network {
+        depths: [1; 4],
+        width: 2,
+        fpn: 5,
+        channels: [3, 8, 16, 8],
+        key_dims: [1, 2, 1],
+        classes: 5,
+        image: [32, 64],
+        grids: [[8, 4, 4], [4, 2, 2], [2, 1, 1]],
+        samples: [1; 3],
+        ..network()
+    }
+}
+
 /// A model file in memory.
 pub(crate) fn model_bytes(network: &Network, precision: Precision, rewrites: Rewrites, seed: u64) -> Vec<u8> {
     bytes_of(&Weights(seed), network, Options { precision, rewrites })
@@ -55,22 +75,6 @@ fn bytes_of(weights: &impl Source, network: &Network, options: Options) -> Vec<u
     let path = directory.path().join("model");
     import(weights, network, options, &path, &mut |_, _| ()).unwrap();
     std::fs::read(&path).unwrap()
-}
-
-/// Pinhole cameras that look outwards, turned by `turn` radians.
-pub(crate) fn lidar2img(network: &Network, turn: f32) -> Vec<[f32; 16]> {
-    let [height, width] = network.image.map(|v| v as f32);
-    let (centre_u, centre_v, focal) = (width / 2.0, height / 2.0, width * 0.7);
-    (0..network.cameras)
-        .map(|i| {
-            let (s, c) = (std::f32::consts::TAU * i as f32 / network.cameras as f32 + turn).sin_cos();
-            let (right, down, ahead) = ([s, -c, 0.0, 0.1], [0.0, 0.0, -1.0, 0.3], [c, s, 0.0, -0.5]);
-            let row = |a: [f32; 4], f: f32, centre: f32| std::array::from_fn(|k| f * a[k] + centre * ahead[k]);
-            let rows: [[f32; 4]; 4] =
-                [row(right, focal, centre_u), row(down, focal, centre_v), ahead, [0., 0., 0., 1.]];
-            rows.concat().try_into().unwrap()
-        })
-        .collect()
 }
 
 pub(crate) fn rig(network: &Network, turn: f32) -> Arc<Rig> {

@@ -1,36 +1,16 @@
 use super::*;
 use crate::graph::Rewrites;
+use crate::graph::parts::Precision;
 use crate::model::Options;
 use crate::model::import::import;
-use crate::model::parts::Precision;
 use crate::model::seeded::SeededWeights;
-use crate::network::{Block, Sampling};
-
-fn network() -> Network {
-    Network {
-        depths: [1; 4],
-        width: 3,
-        dcn: [false, false, true, true],
-        block: Block::Bottleneck,
-        fpn: 9,
-        channels: [9, 8, 16, 24],
-        key_dims: [1, 2, 3],
-        strides: [8, 16, 32],
-        bounds: [[-50.0, 50.0], [-40.0, 40.0], [-5.0, 3.0]],
-        classes: 5,
-        image: [32, 64],
-        grids: [[8, 12, 4], [4, 6, 2], [2, 3, 1]],
-        samples: [2, 2, 2],
-        sampling: Sampling::Linspace,
-        cameras: 6,
-    }
-}
+use crate::small;
 
 fn recorded(precision: Precision) -> (tempfile::TempDir, std::path::PathBuf) {
     let directory = tempfile::tempdir().expect("a directory");
     let path = directory.path().join("model");
     let options = Options { precision, rewrites: Rewrites::ALL };
-    import(&SeededWeights { seed: 1 }, &network(), options, &path, &mut |_, _| ()).expect("a model");
+    import(&SeededWeights { seed: 1 }, &small::tiny(), options, &path, &mut |_, _| ()).expect("a model");
     record(&path, Isa::best(), &Threads::calling()).expect("a self-test");
     (directory, path)
 }
@@ -114,7 +94,7 @@ fn wrong_digests_and_other_operations_are_found() {
 fn a_model_without_or_with_a_malformed_one_says_so() {
     let (directory, path) = recorded(Precision::F32);
     let plain = directory.path().join("plain");
-    import(&SeededWeights { seed: 1 }, &network(), Options::default(), &plain, &mut |_, _| ()).expect("a model");
+    import(&SeededWeights { seed: 1 }, &small::tiny(), Options::default(), &plain, &mut |_, _| ()).expect("a model");
     let error = run(&open(&plain), Isa::best(), &Threads::calling()).expect_err("none");
     assert_eq!(error.kind(), ErrorKind::Unsupported);
     let model = open(&path);

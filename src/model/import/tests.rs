@@ -2,9 +2,12 @@
 
 use super::*;
 use crate::base::random::Random;
-use crate::graph::Rewrites;
+use crate::graph::parts::Storage;
+use crate::graph::{Results, Rewrites};
+use crate::small;
 use std::collections::BTreeMap;
-use voxcast_kernels::panels::packed_index;
+use voxcast_kernels::deconv3d::kernel_tap;
+use voxcast_kernels::panels::{packed_index, packed_len};
 
 /// Drawn weights, kept so that a test can evaluate the layers themselves. Some can be spoilt.
 #[derive(Default)]
@@ -39,27 +42,15 @@ impl Drawn {
     }
 }
 
-fn network() -> Network {
-    Network {
-        depths: [1; 4],
-        width: 2,
-        fpn: 5,
-        channels: [3, 8, 16, 8],
-        key_dims: [1, 2, 1],
-        image: [32, 32],
-        grids: [[8, 4, 4], [4, 2, 2], [2, 1, 1]],
-        ..Network::built_in("nuscenes-200").expect("built in")
-    }
-}
-
 fn graph(rewrites: Rewrites) -> Graph {
-    Graph::build(&network(), true).rewritten(rewrites)
+    Graph::build(&small::tiny(), Results::ALL).rewritten(rewrites)
 }
 
 /// The f32 parts that the operation `name` stores.
 fn evaluate(source: &Drawn, graph: &Graph, name: &str) -> Vec<Vec<f32>> {
     let operation = graph.operations.iter().find(|o| o.name == name).expect(name);
-    Importer { source, graph }.evaluate(operation).expect("sound weights")
+    let values = operation.op.description().evaluate(&graph.site(operation), &Weights(source)).expect("sound weights");
+    values.into_iter().map(|values| values.into_iter().map(|v| v as f32).collect()).collect()
 }
 
 fn assert_near(found: f32, expected: f64, what: &str) {
@@ -193,7 +184,7 @@ fn numbers_that_cannot_be_stored_are_named() {
     let import_with = |name: &'static str, value: f64, precision| {
         let source = Drawn { spoilt: [(name, value)].into(), ..Drawn::default() };
         let options = Options { precision, rewrites: Rewrites::ALL };
-        import(&source, &network(), options, &path, &mut |_, _| ())
+        import(&source, &small::tiny(), options, &path, &mut |_, _| ())
     };
     let conv = "img_backbone.layer1.0.conv1.weight";
     for (name, value, precision, kind, expected) in [
@@ -223,18 +214,30 @@ fn contradictory_options_are_refused_and_progress_is_told() {
     let path = directory.path().join("model");
     let rewrites = Rewrites { batch_norm: false, projection: true };
     let options = Options { rewrites, ..Options::default() };
-    let error = import(&Drawn::default(), &network(), options, &path, &mut |_, _| ()).expect_err("a contradiction");
+    let error = import(&Drawn::default(), &small::tiny(), options, &path, &mut |_, _| ()).expect_err("a contradiction");
     assert_eq!(error.kind(), ErrorKind::Unsupported);
     let mut told = vec![];
-    import(&Drawn::default(), &network(), Options::default(), &path, &mut |done, total| told.push((done, total)))
+    import(&Drawn::default(), &small::tiny(), Options::default(), &path, &mut |done, total| told.push((done, total)))
         .expect("sound weights");
     let total = told.len();
     assert!(total > 50 && told.into_iter().eq((1..=total).map(|done| (done, total))));
 }
 
 #[test]
-fn matrices_multiply() {
-    // [[1, 2], [3, 4], [5, 6]] times [[1, 0, 2], [0, 1, 3]].
-    let found = matmul(&[1., 2., 3., 4., 5., 6.], &[1., 0., 2., 0., 1., 3.], 3, 2, 3);
-    assert_eq!(found, [1., 2., 8., 3., 4., 18., 5., 6., 28.]);
+fn integers_are_stored_exactly_or_refused() {
+    let part = |element| Part { suffix: "x", len: 2, storage: Storage::Always(element) };
+    let encoded = |element, values: &[f64]| encode("x", &part(element), values, Precision::F16);
+    assert_eq!(encoded(Element::I8, &[-128.0, 127.0]).expect("integers")[..3], [128, 127, 0]);
+    let found = encoded(Element::I32, &[-1.0, f64::from(i32::MIN)]).expect("integers");
+    assert_eq!((found.len(), &found[..8]), (64, &[255, 255, 255, 255, 0, 0, 0, 128][..]));
+    for (element, value) in [
+        (Element::I8, 128.0),
+        (Element::U8, -1.0),
+        (Element::I32, 0.5),
+        (Element::I32, 2147483648.0),
+        (Element::I8, f64::NAN),
+    ] {
+        let error = encoded(element, &[value]).expect_err("no such integer");
+        assert!(error.message().contains("expected an integer"), "{error}");
+    }
 }

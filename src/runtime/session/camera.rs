@@ -1,7 +1,4 @@
-//! What a session holds of each camera: the latest image, and how old the features are.
-
-use crate::image::ImageView;
-use crate::runtime::executor::Image;
+//! What a session holds of each camera: the size of the latest image, and how old the features are.
 
 /// A camera's part in a result.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -15,10 +12,9 @@ pub struct CameraStatus {
 }
 
 /// One camera.
-#[derive(Debug)]
-pub(super) struct Camera {
-    /// Room for an image of the network's size.
-    pixels: Vec<u8>,
+#[derive(Clone, Debug, Default)]
+pub(super) struct CameraState {
+    /// Height and width of the latest image.
     size: [usize; 2],
     /// Images received.
     received: u64,
@@ -30,16 +26,10 @@ pub(super) struct Camera {
     pub(super) passed: bool,
 }
 
-impl Camera {
-    /// Without an image; `pixels` is the room for one.
-    pub(super) fn new(pixels: Vec<u8>) -> Self {
-        Self { pixels, size: [0; 2], received: 0, features: 0, age: 0, passed: false }
-    }
-
-    /// Takes the next image, which was checked.
-    pub(super) fn receive(&mut self, image: &ImageView<'_>) {
-        self.size = [image.height, image.width];
-        image.copy_to(&mut self.pixels[..image.height * image.width * 3]);
+impl CameraState {
+    /// The next image has come, of this height and width.
+    pub(super) fn receive(&mut self, size: [usize; 2]) {
+        self.size = size;
         self.received += 1;
     }
 
@@ -53,14 +43,8 @@ impl Camera {
         self.received
     }
 
-    /// The latest image.
-    pub(super) fn image(&self) -> Image<'_> {
-        let [height, width] = self.size;
-        Image { height, width, bgr: &self.pixels[..height * width * 3] }
-    }
-
-    /// Bytes held.
-    pub(super) fn bytes(&self) -> usize {
-        self.pixels.capacity()
+    /// Height and width of the latest image.
+    pub(super) fn size(&self) -> [usize; 2] {
+        self.size
     }
 }

@@ -5,14 +5,14 @@
 //! idle ── features, rig or mask changed, every camera that counts has features ──▶ fusion ──▶ result, idle
 //! ```
 
-use super::camera::Camera;
+use super::camera::CameraState;
 use super::output::Output;
 use super::{CameraStatus, Event, Session};
-use crate::graph::{Graph, Op, Operation, Scope};
-use crate::rig::Level;
-use crate::runtime::executor::{Call, HeadOutput, Slice, csr};
+use crate::graph::parts::MAX_PARTS;
+use crate::graph::{Elements, Graph, Level, Moment, Operation};
+use crate::runtime::arena::{Arena, Regions};
+use crate::runtime::executor::Slice;
 use std::time::{Duration, Instant};
-use voxcast_kernels::Panels;
 use voxcast_kernels::gather::Mask;
 
 /// How much of a frame [`Session::step`] may do.
@@ -77,7 +77,7 @@ struct SliceTimes {
 
 impl Frame {
     /// Begins anew, with every camera to be passed.
-    pub(super) fn restart(&mut self, cameras: &mut [Camera]) {
+    pub(super) fn restart(&mut self, cameras: &mut [CameraState]) {
         self.phase = Phase::Idle;
         self.changed = true;
         for camera in cameras {
@@ -94,7 +94,7 @@ impl Frame {
     }
 
     /// Camera `camera` was masked or is so no longer. A pass under way ends, and what it overwrote are no features.
-    pub(super) fn leave(&mut self, camera: usize, state: &mut Camera) {
+    pub(super) fn leave(&mut self, camera: usize, state: &mut CameraState) {
         if matches!(self.phase, Phase::Pass { camera: c, .. } if c == camera) {
             self.phase = Phase::Idle;
             state.features = 0;
@@ -102,7 +102,7 @@ impl Frame {
     }
 
     /// Rig or mask changed. What was fused is of no use.
-    pub(super) fn sight_changed(&mut self) {
+    pub(super) fn visibility_changed(&mut self) {
         self.changed = true;
         if self.phase == Phase::Fusion {
             self.phase = Phase::Idle;
@@ -214,49 +214,38 @@ impl Session {
         [0, 1, 2].map(|i| self.rig.level(i))
     }
 
+    /// The camera whose pass is under way.
+    fn camera(&self) -> Option<usize> {
+        match self.frame.phase {
+            Phase::Pass { camera, .. } => Some(camera),
+            Phase::Fusion | Phase::Idle => None,
+        }
+    }
+
     /// Runs one of `parts` shares of the operation under way, from its next tile on, and returns the tile after.
     fn operation(&mut self, parts: usize) -> Option<usize> {
-        let Frame { phase, index, tile, .. } = self.frame;
-        let operation = &self.executor.graph.operations[index];
+        let Frame { index, tile, .. } = self.frame;
+        let camera = self.camera();
+        let image = camera.map_or([0; 2], |camera| self.cameras[camera].size());
         let levels = [0, 1, 2].map(|i| self.rig.level(i));
-        let mut panels = [Panels::F32(&[]); crate::model::parts::MAX_PARTS];
-        for (panels, part) in panels.iter_mut().zip(&self.weights[index]) {
-            *panels = self.model.resolve(part);
+        let mut stored = [Elements::EMPTY; MAX_PARTS];
+        let parts_of = &self.weights[index];
+        for (elements, part) in stored.iter_mut().zip(parts_of) {
+            *elements = self.model.resolve(part);
         }
-        let (camera, image) = match phase {
-            Phase::Pass { camera, .. } => (camera, Some(self.cameras[camera].image())),
-            Phase::Fusion | Phase::Idle => (0, None),
-        };
-        let tensor = self.executor.graph.tensor(operation.output);
-        let Output { classes, logits, .. } = &mut self.back;
-        let wanted = !logits.is_empty();
-        let head = match operation.op {
-            Op::Head { level } => Some(HeadOutput {
-                classes: if level == 0 { classes } else { &mut self.coarse_classes[..tensor.rows()] },
-                logits: wanted.then(|| &mut logits[..tensor.len()]),
-            }),
-            _ => None,
-        };
-        let masked = self.masked.contains(&true).then_some(&self.masked[..]);
-        let call = Call { camera, image, levels: &levels, masked, head, slice: Slice { first: tile, parts } };
-        self.executor.run(self.arena.view(), operation, &panels[..self.weights[index].len()], call)
+        let stored = &stored[..parts_of.len()];
+        let moment = Moment { image, levels: &levels, masked: &self.masked };
+        let regions = regions(&mut self.images, &mut self.arena, &mut self.back);
+        self.executor.run(&regions, index, stored, camera, moment, Slice { first: tile, parts })
     }
 
     /// Tells the observer of the operation that has ended.
     fn tell(&mut self, observer: &mut dyn FnMut(Event<'_>)) {
-        let Frame { phase, index, elapsed, longest, .. } = self.frame;
+        let Frame { index, elapsed, longest, .. } = self.frame;
+        let camera = self.camera();
         let operation = &self.executor.graph.operations[index];
-        let camera = match phase {
-            Phase::Pass { camera, .. } => Some(camera),
-            Phase::Fusion | Phase::Idle => None,
-        };
-        let tensor = self.executor.graph.tensor(operation.output);
-        debug_assert!(camera.is_some() || tensor.scope == Scope::Frame);
-        let output = match operation.op {
-            Op::Head { .. } if self.back.logits.is_empty() => &[],
-            Op::Head { .. } => &self.back.logits[..tensor.len()],
-            _ => self.executor.output(self.arena.view(), operation, camera.unwrap_or(0)),
-        };
+        let regions = regions(&mut self.images, &mut self.arena, &mut self.back);
+        let output = self.executor.elements(&regions, operation.result(), camera);
         observer(Event { operation, camera, elapsed, longest, output });
     }
 
@@ -281,7 +270,7 @@ impl Session {
         let pixels = network.feature_pixels(0);
         let mask = self.masked.contains(&true).then_some(Mask { pixels, masked: &self.masked });
         let volume = self.rig.level(0).volume;
-        self.back.count_support(self.sight, volume, mask, network.grids[0], network.output_grid());
+        self.back.count_support(self.visibility, volume, mask, network.grids[0], network.output_grid());
         for ((camera, &masked), status) in self.cameras.iter_mut().zip(&self.masked).zip(&mut self.back.cameras) {
             *status = CameraStatus { image: camera.features, age: camera.age, masked };
             camera.age += 1;
@@ -295,13 +284,14 @@ impl Session {
     }
 }
 
-/// Multiply-adds that take about as long as `operation`: its own, or 20 for each number that it moves, by which a core
-/// computes in registers as fast as it reads memory.
+/// The memory of all tensors.
+fn regions<'a>(images: &'a mut Arena, arena: &'a mut Arena, result: &'a mut Output) -> Regions<'a> {
+    Regions { input: images.view(), arena: arena.view(), output: result.memory_mut().view() }
+}
+
+/// Multiply-adds that take about as long as `operation`: those that it executes, or 20 for each element that it moves, by
+/// which a core computes in registers as fast as it reads memory.
 fn cost(graph: &Graph, operation: &Operation, levels: &[Level<'_>; 3]) -> u64 {
-    let moved = match operation.op {
-        Op::Gather { level, matrix, .. } => csr(levels, level, matrix).col.len().saturating_mul(operation.channels),
-        _ => operation.reads().map(|id| graph.tensor(id).len()).fold(0, usize::saturating_add),
-    };
-    let moved = moved.saturating_add(graph.tensor(operation.output).rows().saturating_mul(operation.channels));
-    graph.multiply_adds(operation).max(20u64.saturating_mul(moved as u64))
+    let moved = operation.op.description().moved(&graph.site(operation), levels);
+    graph.executed_multiply_adds(operation).max(20u64.saturating_mul(moved as u64))
 }

@@ -1,12 +1,11 @@
 //! What a session takes from the system, told before it is made.
 
 use crate::base::error::{Error, ErrorKind, Result};
-use crate::graph::{Graph, Op};
+use crate::graph::{Graph, Results};
 use crate::model::{Model, PartRef};
-use crate::runtime::heap;
-use crate::runtime::plan::Plan;
+use crate::runtime::plan::{Plan, Region};
 use crate::runtime::session::SessionOptions;
-use crate::runtime::session::camera::Camera;
+use crate::runtime::session::camera::CameraState;
 use crate::runtime::session::output::Output;
 
 /// Everything that a session takes from the system, known before it is made, in bytes.
@@ -18,7 +17,7 @@ pub struct Memory {
     pub arena: usize,
     /// The latest image of every camera.
     pub images: usize,
-    /// Two results, of which one is written while the other is read, and the classes of coarse heads.
+    /// Two results, of which one is written while the other is read.
     pub output: usize,
     /// Operations, names and offsets.
     pub tables: usize,
@@ -41,55 +40,31 @@ pub(super) struct Tables {
 
 impl Tables {
     pub(super) fn new(model: &Model, cameras: usize, options: &SessionOptions) -> Result<Self> {
-        let graph = model.graph(options.unfolded, options.coarse_heads);
+        let results = Results { logits: options.logits, coarse_heads: options.coarse_heads };
+        let graph = model.graph(options.unfolded, results);
         let plan = Plan::new(&graph, cameras, options.threads.count())?;
         let weights = graph.operations.iter().map(|o| model.part_refs(&graph, o)).collect::<Result<_>>()?;
         Ok(Self { graph, plan, weights })
     }
 
-    fn bytes(&self) -> usize {
-        let rows: usize = self.weights.iter().map(heap::vector).sum();
-        heap::graph(&self.graph) + self.plan.heap_bytes() + heap::vector(&self.weights) + rows
-    }
-}
-
-/// Lengths of the buffers that are not in the arena.
-pub(super) struct Lengths {
-    pub(super) voxels: usize,
-    /// Logits of the largest head, 0 if nobody wants any.
-    pub(super) logits: usize,
-    /// Voxels of the largest coarse head, 0 if there is none.
-    pub(super) coarse: usize,
-    /// Bytes of one image.
-    pub(super) image: usize,
-}
-
-impl Lengths {
-    pub(super) fn new(graph: &Graph, options: &SessionOptions) -> Self {
-        let heads = || graph.operations.iter().filter(|o| matches!(o.op, Op::Head { .. }));
-        let wanted = options.logits || options.coarse_heads;
-        let logits = heads().filter(|_| wanted).map(|o| graph.tensor(o.output).len()).max();
-        let coarse = heads().filter(|o| o.op != Op::Head { level: 0 }).map(|o| graph.tensor(o.output).rows()).max();
-        let [height, width] = graph.network.image;
-        Self {
-            voxels: graph.network.output_grid().iter().product(),
-            logits: logits.unwrap_or(0),
-            coarse: coarse.unwrap_or(0),
-            image: height * width * 3,
-        }
-    }
-
-    /// Bytes of a session with these tables and buffers.
-    pub(super) fn memory(&self, tables: &Tables, cameras: usize) -> Result<Memory> {
+    /// Bytes of a session with these tables.
+    pub(super) fn memory(&self, cameras: usize) -> Result<Memory> {
         let too_large = || Error::new(ErrorKind::TooLarge, "the session needs more memory than can be addressed");
-        let result = Output::bytes_for(self.voxels, self.logits, cameras).ok_or_else(too_large)?;
+        let output = Output::bytes_for(&self.graph, &self.plan, cameras).and_then(|bytes| bytes.checked_mul(2));
         // Of each camera its record and its flag in the mask.
-        let cameras = self.image.checked_add(size_of::<Camera>() + 1).and_then(|one| one.checked_mul(cameras));
+        let records = cameras.checked_mul(size_of::<CameraState>() + size_of::<bool>());
+        let images = records.and_then(|bytes| bytes.checked_add(self.plan.bytes(Region::Input)));
         Ok(Memory {
-            arena: tables.plan.bytes(),
-            images: cameras.ok_or_else(too_large)?,
-            output: result.checked_mul(2).and_then(|r| r.checked_add(self.coarse)).ok_or_else(too_large)?,
-            tables: tables.bytes(),
+            arena: self.plan.bytes(Region::Arena),
+            images: images.ok_or_else(too_large)?,
+            output: output.ok_or_else(too_large)?,
+            tables: tables(&self.graph, &self.plan, &self.weights),
         })
     }
+}
+
+/// Bytes that the tables take from the allocator.
+pub(super) fn tables(graph: &Graph, plan: &Plan, weights: &Vec<Vec<PartRef>>) -> usize {
+    let parts: usize = weights.iter().map(|parts| parts.capacity() * size_of::<PartRef>()).sum();
+    graph.heap_bytes() + plan.heap_bytes() + weights.capacity() * size_of::<Vec<PartRef>>() + parts
 }

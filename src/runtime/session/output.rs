@@ -2,7 +2,10 @@
 
 use super::CameraStatus;
 use crate::base::digest;
-use crate::rig::Csr;
+use crate::graph::{Csr, Element, Graph, Scope};
+use crate::runtime::arena::Arena;
+use crate::runtime::plan::{Plan, Region};
+use std::ops::Range;
 use voxcast_kernels::gather::Mask;
 
 /// The result of a frame.
@@ -55,36 +58,44 @@ impl Occupancy<'_> {
     }
 }
 
-/// The memory of one result. A session has two: the last complete one, and the one that is being written.
-#[derive(Debug)]
+/// One result. A session has two: the last complete one, and the one that is being written.
 pub(super) struct Output {
-    pub(super) classes: Vec<u8>,
-    /// Logits of level 0, or of the coarse head that wrote last; empty if nobody wants any.
-    pub(super) logits: Vec<f32>,
+    /// The graph's outputs.
+    memory: Arena,
+    /// Bytes of the classes in it.
+    classes: Range<usize>,
+    /// Bytes of the logits of level 0 in it, if the graph has them.
+    logits: Option<Range<usize>>,
     pub(super) support: Vec<u16>,
     pub(super) cameras: Vec<CameraStatus>,
     /// The rig and mask that `support` was counted for, by number.
-    sight: u64,
+    visibility: u64,
 }
 
 impl Output {
     /// Zeros, unless the system has no memory for them.
-    pub(super) fn new(voxels: usize, logits: usize, cameras: usize) -> Option<Self> {
+    pub(super) fn new(graph: &Graph, plan: &Plan, cameras: usize) -> Option<Self> {
+        let place = |element| {
+            let outputs = graph.ids().zip(&graph.tensors).filter(|(_, t)| t.scope == Scope::Output);
+            let (id, tensor) = outputs.into_iter().find(|(_, t)| t.element == element)?;
+            let start = plan.place(id).bytes.start;
+            Some(start..start + tensor.bytes())
+        };
         Some(Self {
-            classes: zeros(voxels)?,
-            logits: zeros(logits)?,
-            support: zeros(voxels)?,
+            memory: Arena::new(plan.bytes(Region::Output))?,
+            classes: place(Element::U8)?,
+            logits: place(Element::F32),
+            support: zeros(voxels(graph))?,
             cameras: zeros(cameras)?,
-            sight: 0,
+            visibility: 0,
         })
     }
 
     /// Bytes that [`Output::new`] takes, unless they cannot be counted.
-    pub(super) fn bytes_for(voxels: usize, logits: usize, cameras: usize) -> Option<usize> {
+    pub(super) fn bytes_for(graph: &Graph, plan: &Plan, cameras: usize) -> Option<usize> {
         let parts = [
-            Some(voxels),
-            voxels.checked_mul(size_of::<u16>()),
-            logits.checked_mul(size_of::<f32>()),
+            Some(plan.bytes(Region::Output)),
+            voxels(graph).checked_mul(size_of::<u16>()),
             cameras.checked_mul(size_of::<CameraStatus>()),
         ];
         parts.into_iter().try_fold(0usize, |sum, part| sum.checked_add(part?))
@@ -92,38 +103,67 @@ impl Output {
 
     /// Bytes held.
     pub(super) fn bytes(&self) -> usize {
-        size_of_val(&self.classes[..])
-            + size_of_val(&self.logits[..])
-            + size_of_val(&self.support[..])
-            + size_of_val(&self.cameras[..])
+        self.memory.len() + size_of_val(&self.support[..]) + size_of_val(&self.cameras[..])
     }
 
-    /// Counts each voxel's pixels, unless `sight` says that they are counted already. `volume` is level 1's, of `coarse`
-    /// voxels, each of which holds a whole number of the voxels of `grid`.
+    /// Where the graph's outputs are written.
+    pub(super) fn memory_mut(&mut self) -> &mut Arena {
+        &mut self.memory
+    }
+
+    /// Whether there are logits.
+    #[cfg(feature = "capi")]
+    pub(super) fn has_logits(&self) -> bool {
+        self.logits.is_some()
+    }
+
+    /// The result of a grid of `grid`.
+    pub(super) fn occupancy(&self, grid: [usize; 3]) -> Occupancy<'_> {
+        let bytes = self.memory.bytes();
+        Occupancy {
+            grid,
+            classes: &bytes[self.classes.clone()],
+            logits: self.logits.clone().map(|logits| bytemuck::cast_slice(&bytes[logits])),
+            support: &self.support,
+            cameras: &self.cameras,
+        }
+    }
+
+    /// Counts each voxel's pixels, unless `visibility` says that they are counted already.
     pub(super) fn count_support(
         &mut self,
-        sight: u64,
+        visibility: u64,
         volume: Csr<'_>,
         mask: Option<Mask<'_>>,
         coarse: [usize; 3],
         grid: [usize; 3],
     ) {
-        if std::mem::replace(&mut self.sight, sight) == sight {
-            return;
+        if std::mem::replace(&mut self.visibility, visibility) != visibility {
+            count_support(&mut self.support, volume, mask, coarse, grid);
         }
-        let [ratio_x, ratio_y, ratio_z] = std::array::from_fn(|a| grid[a] / coarse[a]);
-        let (line, plane) = (grid[2], grid[1] * grid[2]);
-        for (x, plane) in self.support.chunks_exact_mut(plane).enumerate() {
-            for (y, line) in plane.chunks_exact_mut(line).enumerate() {
-                let first = (x / ratio_x * coarse[1] + y / ratio_y) * coarse[2];
-                for (voxels, row) in line.chunks_exact_mut(ratio_z).zip(first..) {
-                    let cols = &volume.col[volume.ptr[row] as usize..volume.ptr[row + 1] as usize];
-                    let count = mask.map_or(cols.len(), |mask| mask.kept(cols).columns());
-                    voxels.fill(u16::try_from(count).unwrap_or(u16::MAX));
-                }
+    }
+}
+
+/// Counts the pixels of each voxel of `grid`. `volume` is the matrix of level 1, of `coarse` voxels, each of which holds a
+/// whole number of the voxels of `grid`.
+fn count_support(support: &mut [u16], volume: Csr<'_>, mask: Option<Mask<'_>>, coarse: [usize; 3], grid: [usize; 3]) {
+    let [ratio_x, ratio_y, ratio_z] = std::array::from_fn(|a| grid[a] / coarse[a]);
+    let (line, plane) = (grid[2], grid[1] * grid[2]);
+    for (x, plane) in support.chunks_exact_mut(plane).enumerate() {
+        for (y, line) in plane.chunks_exact_mut(line).enumerate() {
+            let first = (x / ratio_x * coarse[1] + y / ratio_y) * coarse[2];
+            for (voxels, row) in line.chunks_exact_mut(ratio_z).zip(first..) {
+                let cols = &volume.col[volume.ptr[row] as usize..volume.ptr[row + 1] as usize];
+                let count = mask.map_or(cols.len(), |mask| mask.kept(cols).columns());
+                voxels.fill(u16::try_from(count).unwrap_or(u16::MAX));
             }
         }
     }
+}
+
+/// Voxels of a result.
+fn voxels(graph: &Graph) -> usize {
+    graph.network.output_grid().iter().product()
 }
 
 /// `len` zeros, unless the system has no memory for them.
@@ -137,6 +177,8 @@ pub(super) fn zeros<T: Clone + Default>(len: usize) -> Option<Vec<T>> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::graph::Results;
+    use crate::network::Network;
 
     #[test]
     fn bits_by_hand() {
@@ -152,25 +194,45 @@ mod tests {
     fn support_by_hand() {
         // Two coarse voxels along y of 2x2x2 voxels each; three columns, of which camera 1 has two.
         let volume = Csr { ptr: &[0, 1, 3], col: &[2, 11, 12] };
-        let mut output = Output::new(16, 0, 2).expect("small");
-        output.count_support(1, volume, None, [1, 2, 1], [2, 4, 2]);
-        assert_eq!(output.support, [1, 1, 1, 1, 2, 2, 2, 2, 1, 1, 1, 1, 2, 2, 2, 2]);
+        let (coarse, grid) = ([1, 2, 1], [2, 4, 2]);
+        let mut support = [9; 16];
+        count_support(&mut support, volume, None, coarse, grid);
+        assert_eq!(support, [1, 1, 1, 1, 2, 2, 2, 2, 1, 1, 1, 1, 2, 2, 2, 2]);
         let mask = Mask { pixels: 10, masked: &[false, true] };
-        output.count_support(1, volume, Some(mask), [1, 2, 1], [2, 4, 2]);
-        assert_eq!(output.support[7], 2, "counted already");
-        output.count_support(2, volume, Some(mask), [1, 2, 1], [2, 4, 2]);
-        assert_eq!(output.support, [1, 1, 1, 1, 0, 0, 0, 0, 1, 1, 1, 1, 0, 0, 0, 0]);
-        assert_eq!(output.bytes(), Output::bytes_for(16, 0, 2).expect("small"));
+        count_support(&mut support, volume, Some(mask), coarse, grid);
+        assert_eq!(support, [1, 1, 1, 1, 0, 0, 0, 0, 1, 1, 1, 1, 0, 0, 0, 0]);
         let many: Vec<u32> = (0..70_000).collect();
-        output.count_support(3, Csr { ptr: &[0, 70_000, 70_000], col: &many }, None, [1, 2, 1], [2, 4, 2]);
-        assert_eq!(output.support[..8], [65_535, 65_535, 65_535, 65_535, 0, 0, 0, 0]);
+        count_support(&mut support, Csr { ptr: &[0, 70_000, 70_000], col: &many }, None, coarse, grid);
+        assert_eq!(support[..8], [65_535, 65_535, 65_535, 65_535, 0, 0, 0, 0]);
+    }
+
+    #[test]
+    fn support_is_counted_when_rig_or_mask_change() {
+        let network = Network {
+            image: [32, 32],
+            grids: [[4, 4, 4], [2, 2, 2], [1, 1, 1]],
+            ..Network::built_in("nuscenes-200").expect("built in")
+        };
+        let graph = Graph::build(&network, Results { logits: true, coarse_heads: false });
+        let plan = Plan::new(&graph, 2, 1).expect("small");
+        let mut output = Output::new(&graph, &plan, 2).expect("small");
+        assert_eq!(Some(output.bytes()), Output::bytes_for(&graph, &plan, 2));
+        let result = output.occupancy([8; 3]);
+        assert_eq!((result.classes.len(), result.logits.map(<[f32]>::len)), (512, Some(512 * 17)));
+        let ptr: Vec<u32> = (0..=64).collect();
+        let one = Csr { ptr: &ptr, col: &[0; 64] };
+        output.count_support(1, one, None, [4; 3], [8; 3]);
+        assert_eq!(output.support, [1; 512]);
+        let none = Csr { ptr: &[0; 65], col: &[] };
+        output.count_support(1, none, None, [4; 3], [8; 3]);
+        assert_eq!(output.support, [1; 512], "counted already");
+        output.count_support(2, none, None, [4; 3], [8; 3]);
+        assert_eq!(output.support, [0; 512]);
     }
 
     #[test]
     fn impossible_sizes_are_refused() {
         assert!(zeros::<u32>(usize::MAX / 8).is_none());
         assert_eq!(zeros::<u8>(3), Some(vec![0; 3]));
-        assert!(Output::bytes_for(usize::MAX / 2, 0, 0).is_none());
-        assert!(Output::bytes_for(8, usize::MAX / 2, 0).is_none());
     }
 }

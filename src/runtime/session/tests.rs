@@ -1,33 +1,13 @@
 //! What a session refuses, and what it says of itself.
 
 use super::*;
-use crate::graph::Op;
-use crate::model::Options;
-use crate::model::import::import;
-use crate::model::seeded::SeededWeights;
+use crate::graph::Rewrites;
+use crate::graph::parts::Precision;
 use crate::rig::RigBuilder;
-
-fn network() -> Network {
-    Network {
-        depths: [1; 4],
-        width: 2,
-        fpn: 4,
-        channels: [3, 8, 8, 8],
-        key_dims: [1; 3],
-        classes: 4,
-        image: [32, 64],
-        grids: [[8, 4, 4], [4, 2, 2], [2, 1, 1]],
-        samples: [1; 3],
-        cameras: 2,
-        ..Network::built_in("nuscenes-200").expect("built in")
-    }
-}
+use crate::small::{self, tiny};
 
 fn model() -> Arc<Model> {
-    let directory = tempfile::tempdir().expect("a place");
-    let path = directory.path().join("model");
-    import(&SeededWeights { seed: 1 }, &network(), Options::default(), &path, &mut |_, _| ()).expect("a model");
-    Arc::new(Model::open(&path).expect("a sound model"))
+    small::model(&tiny(), Precision::F32, Rewrites::ALL, 1)
 }
 
 /// Looks ahead along x.
@@ -39,7 +19,7 @@ fn rig(network: &Network, cameras: usize) -> Arc<Rig> {
 }
 
 fn session() -> Session {
-    Session::new(model(), rig(&network(), 2), &SessionOptions::default()).expect("a session")
+    Session::new(model(), rig(&tiny(), 2), &SessionOptions::default()).expect("a session")
 }
 
 #[test]
@@ -72,21 +52,21 @@ fn images_that_do_not_fit_are_refused() {
 #[test]
 fn scenes_that_do_not_fit_are_refused() {
     let mut session = session();
-    let scene = crate::demo::demo_scene(&network(), 1);
+    let scene = small::scene(&tiny(), 1);
     assert_eq!(session.run_scene(&scene).expect("a scene of this network").grid, [16, 8, 8]);
-    let other = crate::demo::demo_scene(&Network { image: [32, 32], ..network() }, 1);
+    let other = small::scene(&Network { image: [32, 32], ..tiny() }, 1);
     assert!(session.run_scene(&other).expect_err("another size").message().contains("32x32"));
-    let fewer = crate::demo::demo_scene(&Network { cameras: 1, ..network() }, 1);
+    let fewer = small::scene(&Network { cameras: 1, ..tiny() }, 1);
     assert!(session.run_scene(&fewer).expect_err("another number").message().contains("1 images"));
 }
 
 #[test]
 fn rigs_of_other_networks_are_refused() {
     let mut session = session();
-    let wider = Network { grids: [[16, 4, 4], [8, 2, 2], [4, 1, 1]], ..network() };
-    let finer = Network { image: [64, 128], ..network() };
+    let wider = Network { grids: [[16, 4, 4], [8, 2, 2], [4, 1, 1]], ..tiny() };
+    let finer = Network { image: [64, 128], ..tiny() };
     for (rig, expected) in [
-        (rig(&network(), 3), "the rig has 3 cameras, expected 2"),
+        (rig(&tiny(), 3), "the rig has 3 cameras, expected 2"),
         (rig(&wider, 2), "level 1: the rig's volume matrix has 256 rows, the network expects 128"),
         (rig(&finer, 2), "level 1: the rig's volume matrix names pixel"),
     ] {
@@ -94,7 +74,7 @@ fn rigs_of_other_networks_are_refused() {
         assert_eq!(error.kind(), ErrorKind::Mismatch);
         assert!(error.message().contains(expected), "{error}");
     }
-    session.set_rig(rig(&network(), 2)).expect("its own");
+    session.set_rig(rig(&tiny(), 2)).expect("its own");
     let error = Session::new(model(), rig(&wider, 2), &SessionOptions::default()).expect_err("another network");
     assert_eq!(error.kind(), ErrorKind::Mismatch);
 }
@@ -110,7 +90,7 @@ fn memory_that_cannot_be_addressed_is_refused() {
 fn events_come_in_running_order() {
     let mut session = session();
     let graph = session.graph().clone();
-    let scene = crate::demo::demo_scene(&network(), 1);
+    let scene = small::scene(&tiny(), 1);
     let mut events = vec![];
     session
         .run_observed(&views(&scene), &mut |e| events.push((e.operation.name.clone(), e.camera, e.output.len())))
@@ -121,9 +101,7 @@ fn events_come_in_running_order() {
         let index = if i < 2 * passes { i % passes } else { i - passes };
         assert_eq!(*name, graph.operations[index].name);
         assert_eq!(*camera, (i < 2 * passes).then_some(i / passes), "{name}");
-        let head = matches!(graph.operations[index].op, Op::Head { .. });
-        let expected = if head { 0 } else { graph.tensor(graph.operations[index].output).len() };
-        assert_eq!(*len, expected, "{name}");
+        assert_eq!(*len, graph.tensor(graph.operations[index].result()).len(), "{name}");
     }
     assert_eq!(session.cameras(), 2);
     assert!(format!("{session:?}").starts_with("Session"));

@@ -1,5 +1,6 @@
 use super::*;
 use crate::base::error::ErrorKind;
+use crate::network::Grid;
 use crate::show::picture::Class;
 use flate2::read::{GzDecoder, ZlibDecoder};
 use serde_json::Value;
@@ -32,7 +33,7 @@ fn scene() -> Scene {
 /// The page of everything above.
 fn page(truth: Option<&[u8]>, scene: Option<&Scene>, title: &str, palette: &Palette) -> Result<String> {
     let (classes, support) = (classes(), support());
-    let prediction = Occupancy::new("", &classes, GRID, BOUNDS, [0.0, 1.0])?.with_support(&support)?;
+    let prediction = Occupancy::new("", &classes, Grid::new(GRID, BOUNDS), [0.0, 1.0])?.with_support(&support)?;
     Page { title, subtitle: "of a test", prediction, truth, scene, palette }.to_html()
 }
 
@@ -101,7 +102,7 @@ fn the_page_holds_what_it_was_given() {
 #[test]
 fn what_is_not_given_is_not_there() {
     let classes = classes();
-    let prediction = Occupancy::new("", &classes, GRID, BOUNDS, [0.0, 1.0]).unwrap();
+    let prediction = Occupancy::new("", &classes, Grid::new(GRID, BOUNDS), [0.0, 1.0]).unwrap();
     let palette = Palette::of(5);
     let html = Page { title: "", subtitle: "", prediction, truth: None, scene: None, palette: &palette };
     let data = data(&html.to_html().unwrap());
@@ -216,7 +217,7 @@ fn what_does_not_fit_is_refused() {
 fn the_file_is_written_whole() {
     let directory = tempfile::tempdir().unwrap();
     let classes = classes();
-    let prediction = Occupancy::new("", &classes, GRID, BOUNDS, [0.0, 1.0]).unwrap();
+    let prediction = Occupancy::new("", &classes, Grid::new(GRID, BOUNDS), [0.0, 1.0]).unwrap();
     let palette = Palette::of(17);
     let page = Page { title: "t", subtitle: "", prediction, truth: None, scene: None, palette: &palette };
     let path = directory.path().join("out.html");

@@ -1,7 +1,7 @@
 //! The bird's-eye-view map: the class of the highest voxel of each column, forward up, shaded by height.
 
 use super::canvas::{Canvas, Rect, Rgb, display, light};
-use super::grid::Grid;
+use super::cells::Cells;
 use super::text::{Fonts, Weight};
 use super::{Occupancy, Palette, vehicle};
 use glam::Vec3;
@@ -41,14 +41,14 @@ impl Orientation {
     }
 
     /// Metres along (right, up) from the map's lower left corner to a point of the frame.
-    fn place(&self, grid: &Grid, p: Vec3) -> [f32; 2] {
+    fn place(&self, grid: &Cells, p: Vec3) -> [f32; 2] {
         let along =
             |axis: usize, grows: bool| if grows { p[axis] - grid.low[axis] } else { grid.high()[axis] - p[axis] };
         [along(self.right, self.right_grows), along(self.up, self.up_grows)]
     }
 
     /// Metres from left to right and from bottom to top.
-    fn extent(&self, grid: &Grid) -> [f32; 2] {
+    fn extent(&self, grid: &Cells) -> [f32; 2] {
         let size = grid.high() - grid.low;
         [size[self.right], size[self.up]]
     }
@@ -57,13 +57,13 @@ impl Orientation {
 /// Width over height of the map of `occupancy`, from 1/4 to 4.
 pub(crate) fn aspect(occupancy: &Occupancy<'_>) -> f32 {
     let o = Orientation::of(occupancy.forward);
-    let length = |k: usize| occupancy.bounds[k][1] - occupancy.bounds[k][0];
+    let length = |k: usize| occupancy.grid.bounds[k][1] - occupancy.grid.bounds[k][0];
     (length(o.right) / length(o.up)).clamp(0.25, 4.0)
 }
 
 /// Draws the map into `rect`, with the vehicle, an arrow ahead of it and a scale bar.
 pub(crate) fn draw(canvas: &mut Canvas, rect: Rect, occupancy: &Occupancy<'_>, palette: &Palette, fonts: &Fonts) {
-    let grid = Grid::new(occupancy, palette);
+    let grid = Cells::new(occupancy, palette);
     let orientation = Orientation::of(occupancy.forward);
     let columns = columns(&grid, palette);
     canvas.put(rect, &pixels(&grid, &orientation, &columns, rect.w, rect.h));
@@ -88,7 +88,7 @@ struct Column {
 }
 
 /// The columns of the grid, x slowest.
-fn columns(grid: &Grid, palette: &Palette) -> Vec<Column> {
+fn columns(grid: &Cells, palette: &Palette) -> Vec<Column> {
     let [nx, ny, nz] = grid.size;
     let lights: Vec<Vec3> = palette.classes().iter().map(|c| Vec3::from_array(c.rgb.map(light))).collect();
     let heights: Vec<usize> =
@@ -145,7 +145,7 @@ fn columns(grid: &Grid, palette: &Palette) -> Vec<Column> {
     columns
 }
 
-fn pixels(grid: &Grid, o: &Orientation, columns: &[Column], w: usize, h: usize) -> Vec<u8> {
+fn pixels(grid: &Cells, o: &Orientation, columns: &[Column], w: usize, h: usize) -> Vec<u8> {
     // Cell along an axis of the grid, and where in it the sample lies, in 0..1.
     let locate = |axis: usize, grows: bool, sample: usize, samples: usize| {
         let n = grid.size[axis];
@@ -184,7 +184,7 @@ fn pixels(grid: &Grid, o: &Orientation, columns: &[Column], w: usize, h: usize) 
 }
 
 /// The vehicle in its true place and size (but never too small to see), and an arrow along its forward direction.
-fn marker(canvas: &mut Canvas, rect: Rect, grid: &Grid, o: &Orientation, per_metre: [f32; 2]) {
+fn marker(canvas: &mut Canvas, rect: Rect, grid: &Cells, o: &Orientation, per_metre: [f32; 2]) {
     let unit = per_metre[0].min(per_metre[1]);
     let [length, width] = vehicle::SIZE;
     let length = (length * unit).max(34.0);
@@ -270,6 +270,7 @@ fn round_length(limit: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::network::Grid;
 
     #[test]
     fn lengths_are_round() {
@@ -288,8 +289,8 @@ mod tests {
             let mut classes = vec![0u8; 8 * 8 * 2];
             classes[(voxel[0] * 8 + voxel[1]) * 2] = 11;
             let bounds = [[-4.0, 4.0], [-4.0, 4.0], [-1.0, 1.0]];
-            let occupancy = Occupancy::new("", &classes, [8, 8, 2], bounds, forward).unwrap();
-            let grid = Grid::new(&occupancy, &palette);
+            let occupancy = Occupancy::new("", &classes, Grid::new([8, 8, 2], bounds), forward).unwrap();
+            let grid = Cells::new(&occupancy, &palette);
             let o = Orientation::of(forward);
             let rgb = pixels(&grid, &o, &columns(&grid, &palette), 80, 80);
             let magenta: Vec<[usize; 2]> =

@@ -127,6 +127,7 @@ pub(crate) fn thousands(n: usize) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::network::Grid;
 
     #[test]
     fn numbers_read_well() {
@@ -142,7 +143,7 @@ mod tests {
     fn counts_and_shares_are_of_the_occupied_voxels() {
         let classes = [0, 0, 4, 4, 4, 1, 255, 17];
         let bounds = [[-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0]];
-        let occupancy = Occupancy::new("", &classes, [2, 2, 2], bounds, [0.0, 1.0]).unwrap();
+        let occupancy = Occupancy::new("", &classes, Grid::new([2, 2, 2], bounds), [0.0, 1.0]).unwrap();
         let entries = entries(&[occupancy], &Palette::of(17));
         assert_eq!((entries.len(), entries[3].name.as_str(), entries[3].counts[0]), (16, "car", (3, 0.75)));
         assert_eq!(entries[0].counts[0], (1, 0.25));

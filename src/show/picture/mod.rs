@@ -7,11 +7,12 @@
 mod animation;
 mod bev;
 mod canvas;
-mod grid;
+mod cells;
 mod layout;
 mod legend;
 mod matrix;
 mod palette;
+mod patch;
 mod text;
 mod vehicle;
 mod voxels;
@@ -22,12 +23,12 @@ pub use palette::{Class, Palette};
 pub use text::FONT_LICENSE;
 
 use crate::base::error::{Error, ErrorKind, Result};
-use crate::file::replace::replace_file;
+use crate::image::png::write_rgb_png;
+use crate::network::Grid;
 use crate::scene::Image;
 use canvas::{Canvas, Rect, Rgb};
-use image::codecs::png::{CompressionType, FilterType as PngFilter, PngEncoder};
 use image::imageops::{self, FilterType};
-use image::{ExtendedColorType, ImageBuffer, ImageEncoder, Rgb as RgbPixel};
+use image::{ImageBuffer, Rgb as RgbPixel};
 use layout::{GAP, LABEL, MARGIN, PAGE};
 use std::path::Path;
 use text::{Fonts, Weight};
@@ -50,43 +51,36 @@ const GREY: Rgb = [98, 104, 114];
 pub struct Occupancy<'a> {
     pub(crate) caption: &'a str,
     pub(crate) classes: &'a [u8],
-    pub(crate) grid: [usize; 3],
-    pub(crate) bounds: [[f32; 2]; 3],
+    pub(crate) grid: Grid,
     pub(crate) forward: [f32; 2],
     pub(crate) support: &'a [u16],
 }
 
 impl<'a> Occupancy<'a> {
-    /// A view of `classes`, row-major [X, Y, Z] with x slowest and `grid` = [X, Y, Z].
+    /// A view of `classes`, row-major [X, Y, Z] with x slowest, of the voxels of `grid`.
     ///
-    /// `bounds` are [min, max] metres of the grid along x, y, z in the lidar frame, whose origin is taken for the place of
-    /// the vehicle. `forward` is the vehicle's direction in the x-y plane, of any length (see
-    /// [`forward_of`](crate::scene::forward_of)); the map turns in quarter turns only. `caption` names the occupancy in the
+    /// The origin of the grid's frame is taken for the place of the vehicle. `forward` is the vehicle's direction in the x-y
+    /// plane, of any length (see [`Grid::forward`]); the map turns in quarter turns only. `caption` names the occupancy in the
     /// picture, such as "prediction"; it may be empty. Class 0, and classes that the palette does not have, are not drawn.
     ///
     /// # Errors
     /// [`ErrorKind::Mismatch`] when `classes` has not as many bytes as the grid has voxels; [`ErrorKind::Format`] for an axis
     /// without voxels, for bounds that are not finite and ascending, and for a forward direction that is not finite or zero;
     /// [`ErrorKind::TooLarge`] beyond 2^27 voxels or an axis beyond 4096.
-    pub fn new(
-        caption: &'a str,
-        classes: &'a [u8],
-        grid: [usize; 3],
-        bounds: [[f32; 2]; 3],
-        forward: [f32; 2],
-    ) -> Result<Self> {
-        if grid.contains(&0) {
-            return Err(Error::format(format!("grid {grid:?}, expected at least one voxel on every axis")));
+    pub fn new(caption: &'a str, classes: &'a [u8], grid: Grid, forward: [f32; 2]) -> Result<Self> {
+        let size = grid.size;
+        if size.contains(&0) {
+            return Err(Error::format(format!("grid {size:?}, expected at least one voxel on every axis")));
         }
-        let voxels = grid.iter().try_fold(1usize, |n, &v| n.checked_mul(v));
-        let Some(voxels) = voxels.filter(|&n| n <= MAX_VOXELS && grid.iter().all(|&v| v <= 4096)) else {
-            let message = format!("grid {grid:?}, expected at most {MAX_VOXELS} voxels and 4096 on an axis");
+        let voxels = size.iter().try_fold(1usize, |n, &v| n.checked_mul(v));
+        let Some(voxels) = voxels.filter(|&n| n <= MAX_VOXELS && size.iter().all(|&v| v <= 4096)) else {
+            let message = format!("grid {size:?}, expected at most {MAX_VOXELS} voxels and 4096 on an axis");
             return Err(Error::new(ErrorKind::TooLarge, message));
         };
         if classes.len() != voxels {
-            return Err(Error::mismatch(format!("{} classes, expected {voxels} for grid {grid:?}", classes.len())));
+            return Err(Error::mismatch(format!("{} classes, expected {voxels} for grid {size:?}", classes.len())));
         }
-        for (axis, [low, high]) in ["x", "y", "z"].iter().zip(bounds) {
+        for (axis, [low, high]) in ["x", "y", "z"].iter().zip(grid.bounds) {
             let sane = low.is_finite() && high.is_finite() && high - low >= 1e-3 && low.abs().max(high.abs()) <= 1e5;
             if !sane {
                 let message = format!("bounds [{low}, {high}] on {axis}, expected ascending metres within 100 km");
@@ -99,7 +93,7 @@ impl<'a> Occupancy<'a> {
             return Err(Error::format(format!("forward direction {forward:?}, expected finite numbers, not both 0")));
         }
         let forward = [(fx / length) as f32, (fy / length) as f32];
-        Ok(Self { caption, classes, grid, bounds, forward, support: &[] })
+        Ok(Self { caption, classes, grid, forward, support: &[] })
     }
 
     /// The same with the number of pixels that see each voxel: places that no camera sees are hatched on the map and pale
@@ -158,17 +152,6 @@ impl Picture {
     }
 }
 
-/// Writes `height` rows of `width` RGB pixels as PNG.
-pub(crate) fn write_rgb_png(path: &Path, width: usize, height: usize, rgb: &[u8]) -> Result<()> {
-    let side = |v: usize| u32::try_from(v).map_err(|_| Error::new(ErrorKind::TooLarge, format!("picture side of {v}")));
-    let (width, height) = (side(width)?, side(height)?);
-    replace_file(path, |out| {
-        PngEncoder::new_with_quality(out, CompressionType::Default, PngFilter::Adaptive)
-            .write_image(rgb, width, height, ExtendedColorType::Rgb8)
-            .map_err(std::io::Error::other)
-    })
-}
-
 /// Draws the 3-D view of `occupancy` alone, on white. Sides are taken as 1 to 8192 pixels.
 pub fn draw_voxels(occupancy: &Occupancy<'_>, palette: &Palette, width: usize, height: usize) -> Picture {
     let (width, height) = (width.clamp(1, 8192), height.clamp(1, 8192));
@@ -200,9 +183,14 @@ pub fn draw(figure: &Figure<'_>) -> Picture {
     y += if places.is_empty() { 0 } else { LABEL + height + GAP };
     let mut views = Vec::new();
     for occupancy in occupancies {
-        let (map, view) = layout::views(y + LABEL, bev::aspect(occupancy), occupancies.len());
-        views.push((y, map, view));
-        y += LABEL + view.h + GAP;
+        let places = |top: usize| layout::views(top + LABEL, bev::aspect(occupancy), occupancies.len());
+        let (_, view) = places(y);
+        let note =
+            Note::new(&fonts, &caption("Semantic occupancy", occupancy), occupancy, figure.palette, view.w as f32);
+        let (map, view) = places(y + note.height());
+        let top = y;
+        y += note.height() + LABEL + view.h + GAP;
+        views.push((top, map, view, note));
     }
     let entries = legend::entries(occupancies, figure.palette);
     let legend_at = y;
@@ -217,14 +205,12 @@ pub fn draw(figure: &Figure<'_>) -> Picture {
     for ((name, image), place) in images.iter().zip(&places) {
         draw_image(&mut canvas, *place, image, &fonts, name);
     }
-    for (occupancy, (top, map, view)) in occupancies.iter().zip(views) {
-        let caption = |what: &str| match occupancy.caption {
-            "" => what.to_owned(),
-            of => format!("{what}, {of}"),
-        };
-        label.draw(&mut canvas, &fonts, map.x, top, &caption("Bird’s-eye view"), "", (map.w + GAP) as f32);
-        let note = note(occupancy, figure.palette);
-        label.draw(&mut canvas, &fonts, view.x, top, &caption("Semantic occupancy"), &note, view.w as f32);
+    for (occupancy, (top, map, view, note)) in occupancies.iter().zip(views) {
+        let map_caption = caption("Bird’s-eye view", occupancy);
+        label.draw(&mut canvas, &fonts, map.x, top, &map_caption, "", (map.w + GAP) as f32);
+        let view_caption = caption("Semantic occupancy", occupancy);
+        label.draw(&mut canvas, &fonts, view.x, top, &view_caption, &note.beside, view.w as f32);
+        note.draw_below(&mut canvas, &fonts, view.x, top + LABEL);
         bev::draw(&mut canvas, map, occupancy, figure.palette, &fonts);
         canvas.put(view, &voxels::render(occupancy, figure.palette, view.w, view.h, PAPER));
     }
@@ -235,6 +221,13 @@ pub fn draw(figure: &Figure<'_>) -> Picture {
 const TITLE_SIZE: f32 = 46.0;
 const SUBTITLE_SIZE: f32 = 27.0;
 const LABEL_SIZE: f32 = 28.0;
+const NOTE_SIZE: f32 = 23.0;
+/// Least distance from a caption to the note beside it.
+const NOTE_GAP: f32 = 24.0;
+/// Height of a line of a note below its caption.
+const NOTE_LINE: usize = 34;
+/// More than a note ever takes.
+const MAX_NOTE_LINES: usize = 8;
 
 /// Hands out (a), (b), (c) ... in the order of the panels.
 #[derive(Default)]
@@ -251,11 +244,48 @@ impl Labels {
         let mut used = fonts.draw(canvas, &letter, [x, y], LABEL_SIZE, Weight::Bold, INK);
         let text = fonts.fit(text, LABEL_SIZE, Weight::Regular, width - used);
         used += fonts.draw(canvas, &text, [x + used, y], LABEL_SIZE, Weight::Regular, INK);
-        let room = width - used - 24.0;
+        let room = width - used - NOTE_GAP;
         if !note.is_empty() && room > 100.0 {
-            let note = fonts.fit(note, 23.0, Weight::Regular, room);
-            let left = x + width - fonts.width(&note, 23.0, Weight::Regular);
-            fonts.draw(canvas, &note, [left, y], 23.0, Weight::Regular, GREY);
+            let note = fonts.fit(note, NOTE_SIZE, Weight::Regular, room);
+            let left = x + width - fonts.width(&note, NOTE_SIZE, Weight::Regular);
+            fonts.draw(canvas, &note, [left, y], NOTE_SIZE, Weight::Regular, GREY);
+        }
+    }
+}
+
+/// What a panel shows, and of which occupancy.
+fn caption(what: &str, occupancy: &Occupancy<'_>) -> String {
+    match occupancy.caption {
+        "" => what.to_owned(),
+        of => format!("{what}, {of}"),
+    }
+}
+
+/// The note of a 3-D view: beside its caption, or in lines of its own below it where it is too long for that.
+struct Note {
+    beside: String,
+    below: Vec<String>,
+}
+
+impl Note {
+    fn new(fonts: &Fonts, caption: &str, occupancy: &Occupancy<'_>, palette: &Palette, width: f32) -> Self {
+        let note = note(occupancy, palette);
+        // No letter is wider than m.
+        let used = fonts.width("(m) ", LABEL_SIZE, Weight::Bold) + fonts.width(caption, LABEL_SIZE, Weight::Regular);
+        if used + NOTE_GAP + fonts.width(&note, NOTE_SIZE, Weight::Regular) <= width {
+            return Self { beside: note, below: vec![] };
+        }
+        Self { beside: String::new(), below: fonts.wrap(&note, NOTE_SIZE, Weight::Regular, width, MAX_NOTE_LINES) }
+    }
+
+    fn height(&self) -> usize {
+        self.below.len() * NOTE_LINE
+    }
+
+    fn draw_below(&self, canvas: &mut Canvas, fonts: &Fonts, x: usize, top: usize) {
+        for (i, line) in self.below.iter().enumerate() {
+            let y = (top + (i + 1) * NOTE_LINE) as f32 - 18.0;
+            fonts.draw(canvas, line, [x as f32, y], NOTE_SIZE, Weight::Regular, GREY);
         }
     }
 }
@@ -263,10 +293,10 @@ impl Labels {
 /// Size of the grid and of a voxel, and how many are occupied.
 fn note(occupancy: &Occupancy<'_>, palette: &Palette) -> String {
     let occupied = occupancy.classes.iter().filter(|&&c| palette.is_drawn(c)).count();
-    let [x, y, z] = occupancy.grid;
+    let [x, y, z] = occupancy.grid.size;
     let step: [f32; 3] = std::array::from_fn(|k| {
-        let [low, high] = occupancy.bounds[k];
-        ((high - low) / occupancy.grid[k] as f32 * 1000.0).round() / 1000.0
+        let [low, high] = occupancy.grid.bounds[k];
+        ((high - low) / occupancy.grid.size[k] as f32 * 1000.0).round() / 1000.0
     });
     let size = match step {
         [a, b, c] if a == b && b == c => format!("{a} m"),

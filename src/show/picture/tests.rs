@@ -8,7 +8,7 @@ fn image(height: usize, width: usize, seed: usize) -> Image {
 }
 
 fn occupancy(classes: &[u8], grid: [usize; 3]) -> Occupancy<'_> {
-    Occupancy::new("test", classes, grid, BOUNDS, [0.0, 1.0]).unwrap()
+    Occupancy::new("test", classes, Grid::new(grid, BOUNDS), [0.0, 1.0]).unwrap()
 }
 
 fn figure_of(images: &[(&str, &Image)], occupancies: &[Occupancy<'_>], classes: usize) -> Picture {
@@ -36,8 +36,9 @@ fn equal_figures_give_equal_bytes_and_others_do_not() {
 
 #[test]
 fn occupancy_that_is_none_is_refused() {
-    let new =
-        |n: usize, grid, bounds, forward| Occupancy::new("", &[1; 8][..n], grid, bounds, forward).map_err(|e| e.kind());
+    let new = |n: usize, grid, bounds, forward| {
+        Occupancy::new("", &[1; 8][..n], Grid::new(grid, bounds), forward).map_err(|e| e.kind())
+    };
     let up = [0.0, 1.0];
     assert!(new(8, [2, 2, 2], BOUNDS, [3.0, -4.0]).is_ok());
     assert_eq!(new(7, [2, 2, 2], BOUNDS, up), Err(ErrorKind::Mismatch));
@@ -92,6 +93,35 @@ fn two_occupancies_stand_below_each_other() {
 }
 
 #[test]
+fn the_note_of_a_view_is_always_whole() {
+    let fonts = Fonts::new();
+    let palette = Palette::of(17);
+    let classes = vec![0u8; 104 * 104 * 8];
+    let support = vec![0u16; classes.len()];
+    let bounds = [[-50.0, 50.0], [-50.0, 50.0], [-5.0, 2.7]];
+    for (bounds, caption) in [
+        (bounds, ""),
+        ([[-50.0, 50.0], [-50.0, 50.0], [-5.3, 2.396]], "prediction"),
+        ([[-50.1, 51.7], [-50.0, 50.0], [-5.0, 3.0]], "a rather long name of what was predicted"),
+    ] {
+        let occupancy = Occupancy::new(caption, &classes, Grid::new([104, 104, 8], bounds), [0.0, 1.0]).unwrap();
+        let occupancy = occupancy.with_support(&support).unwrap();
+        let whole = note(&occupancy, &palette);
+        assert!(whole.starts_with("104 × 104 × 8 voxels of ") && whole.ends_with(" m"), "{whole}");
+        for (aspect, shown) in [(1.0, 1), (4.0, 4), (0.25, 2)] {
+            let (_, view) = layout::views(0, aspect, shown);
+            let words = super::caption("Semantic occupancy", &occupancy);
+            let note = Note::new(&fonts, &words, &occupancy, &palette, view.w as f32);
+            let shown = if note.below.is_empty() { note.beside.clone() } else { note.below.join(" ") };
+            assert_eq!(shown, whole);
+            assert_eq!(note.beside.is_empty(), !note.below.is_empty());
+            let most = note.below.iter().map(|line| fonts.width(line, NOTE_SIZE, Weight::Regular)).fold(0.0, f32::max);
+            assert!(most <= view.w as f32);
+        }
+    }
+}
+
+#[test]
 fn png_holds_the_same_pixels() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("p.png");
@@ -128,7 +158,7 @@ proptest! {
         let images: Vec<Image> = (0..cameras).map(|k| image(sides[0] + k, sides[1], k)).collect();
         let images: Vec<(&str, &Image)> = images.iter().map(|i| ("CAM_X", i)).collect();
         let bounds = std::array::from_fn(|k| [low[k], low[k] + size[k]]);
-        let occupancies: Vec<_> = Occupancy::new("any", &cells, grid, bounds, forward)
+        let occupancies: Vec<_> = Occupancy::new("any", &cells, Grid::new(grid, bounds), forward)
             .and_then(|o| if seed % 2 == 0 { o.with_support(&support) } else { Ok(o) })
             .into_iter()
             .collect();

@@ -1,7 +1,7 @@
 //! The vehicle that carries the cameras, as a simple car: two prisms across its width.
 
-use super::grid::Grid;
-use super::voxels::Patch;
+use super::cells::Cells;
+use super::patch::Patch;
 use glam::{DVec3, Vec3};
 
 /// A flat part of the car.
@@ -24,7 +24,7 @@ const WHEEL: [[f64; 2]; 8] =
     [[-0.14, 0.0], [0.14, 0.0], [0.34, 0.2], [0.34, 0.48], [0.14, 0.68], [-0.14, 0.68], [-0.34, 0.48], [-0.34, 0.2]];
 
 /// The parts of the car that stands at the origin of the grid's frame, on the road there.
-pub(crate) fn parts(grid: &Grid) -> Vec<Part> {
+pub(crate) fn parts(grid: &Cells) -> Vec<Part> {
     let (ahead, left) = (grid.ahead.as_dvec3(), grid.left().as_dvec3());
     let origin = DVec3::Z * f64::from(grid.road());
     let place = |p: [f64; 2], y: f64| origin + ahead * p[0] + left * y + DVec3::Z * p[1];

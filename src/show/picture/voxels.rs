@@ -5,7 +5,8 @@
 //! bands of rows, so that memory stays small. One thread, fixed order: equal input gives equal bytes.
 
 use super::canvas::{display, light};
-use super::grid::{Grid, SUN_DISC};
+use super::cells::{Cells, SUN_DISC};
+use super::patch::Patch;
 use super::vehicle;
 use super::{Occupancy, Palette};
 use glam::{DVec3, Vec3};
@@ -45,16 +46,8 @@ struct Face {
     rows: [u16; 2],
 }
 
-/// A flat piece in space: a parallelogram of two edges, or half of it.
-#[derive(Clone, Copy)]
-pub(crate) struct Patch {
-    pub(crate) corner: DVec3,
-    pub(crate) edges: [DVec3; 2],
-    pub(crate) triangle: bool,
-}
-
 /// The camera: an eye, three axes, and an off-centre window on its image plane.
-struct View {
+struct Viewpoint {
     eye: DVec3,
     right: DVec3,
     up: DVec3,
@@ -75,9 +68,9 @@ struct Seen {
     triangle: bool,
 }
 
-impl View {
+impl Viewpoint {
     /// The camera that shows all of the grid's ground plan, and the drawn layers on it, in `w` x `h` samples.
-    fn new(grid: &Grid, floor: f32, w: usize, h: usize) -> Self {
+    fn new(grid: &Cells, floor: f32, w: usize, h: usize) -> Self {
         let (ahead_h, left) = (grid.ahead.as_dvec3(), grid.left().as_dvec3());
         let ahead = (ahead_h * 0.97 + left * 0.24 - DVec3::Z * 0.74).normalize();
         let right = ahead.cross(DVec3::Z).normalize();
@@ -188,10 +181,10 @@ pub(crate) fn render(
     page: [u8; 3],
 ) -> Vec<u8> {
     let (width, height) = (width.clamp(1, MAX_PANEL), height.clamp(1, MAX_PANEL));
-    let grid = Grid::new(occupancy, palette);
+    let grid = Cells::new(occupancy, palette);
     let floor = grid.floor();
     let (w, h) = (width * SAMPLES, height * SAMPLES);
-    let view = View::new(&grid, floor, w, h);
+    let view = Viewpoint::new(&grid, floor, w, h);
     let mut faces = visible_faces(&grid, &view, w, h);
     let car = if grid.holds_vehicle() { vehicle::parts(&grid) } else { Vec::new() };
     // Within a band faces keep their order, whatever the sort: it decides between samples of equal depth.
@@ -236,13 +229,13 @@ fn face_axes(side: u8) -> [usize; 2] {
     [[1, 2], [0, 2], [0, 1]][usize::from(side / 2)]
 }
 
-fn coordinates(grid: &Grid, voxel: u32) -> [i32; 3] {
+fn coordinates(grid: &Cells, voxel: u32) -> [i32; 3] {
     let [_, y, z] = grid.size;
     let voxel = voxel as usize;
     [(voxel / z / y) as i32, (voxel / z % y) as i32, (voxel % z) as i32]
 }
 
-fn patch(grid: &Grid, face: &Face) -> Patch {
+fn patch(grid: &Cells, face: &Face) -> Patch {
     let mut corner = coordinates(grid, face.voxel);
     corner[usize::from(face.side / 2)] += i32::from(face.side % 2);
     let step = grid.step.as_dvec3();
@@ -252,7 +245,7 @@ fn patch(grid: &Grid, face: &Face) -> Patch {
     Patch { corner, edges: [edge(a), edge(b)], triangle: false }
 }
 
-fn visible_faces(grid: &Grid, view: &View, w: usize, h: usize) -> Vec<Face> {
+fn visible_faces(grid: &Cells, view: &Viewpoint, w: usize, h: usize) -> Vec<Face> {
     let eye = (view.eye.as_vec3() - grid.low) / grid.step;
     let mut faces = Vec::new();
     for (voxel, &class) in grid.cells.iter().enumerate() {
@@ -299,8 +292,8 @@ fn visible_faces(grid: &Grid, view: &View, w: usize, h: usize) -> Vec<Face> {
 
 /// Everything that a sample's colour depends on.
 struct Shader<'a> {
-    grid: &'a Grid,
-    view: &'a View,
+    grid: &'a Cells,
+    view: &'a Viewpoint,
     car: &'a [vehicle::Part],
     faces: &'a [Face],
     colours: Vec<Vec3>,

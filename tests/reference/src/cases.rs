@@ -11,11 +11,12 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use voxcast::checkpoint::Checkpoint;
 use voxcast::container::{self, Data, Layout};
-use voxcast::demo::demo_scene;
 use voxcast::import::Source;
 use voxcast::scene::{Image, Scene};
 use voxcast::{Network, weights::Precision};
 
+#[path = "../../support/scene.rs"]
+mod scene;
 #[path = "../../support/weights.rs"]
 mod weights;
 
@@ -85,7 +86,7 @@ impl Case {
         let path = directory.join("scene.safetensors");
         if !path.exists() {
             let network = read_network(directory)?;
-            write_scene(&path, &cropped(demo_scene(&network, seed)))?;
+            write_scene(&path, &cropped(scene::scene(&network, seed)))?;
         }
         Self::read(directory, Box::new(weights::Tempered(seed)))
     }

@@ -5,29 +5,9 @@ use std::cell::RefCell;
 use std::collections::HashMap;
 use wgpu::util::DeviceExt;
 
-/// Every shader, by the name of its file. Each computes one element of its output per invocation, from a struct of shapes
+/// Where the shaders lie, a file for each. Each computes one element of its output per invocation, from a struct of shapes
 /// and its inputs, in the order of their bindings.
-const SHADERS: [(&str, &str); 19] = [
-    ("add", include_str!("../shaders/add.wgsl")),
-    ("argmax", include_str!("../shaders/argmax.wgsl")),
-    ("batch_norm", include_str!("../shaders/batch_norm.wgsl")),
-    ("broadcast", include_str!("../shaders/broadcast.wgsl")),
-    ("conv", include_str!("../shaders/conv.wgsl")),
-    ("deconv", include_str!("../shaders/deconv.wgsl")),
-    ("deform_conv", include_str!("../shaders/deform_conv.wgsl")),
-    ("depthwise", include_str!("../shaders/depthwise.wgsl")),
-    ("gate", include_str!("../shaders/gate.wgsl")),
-    ("gather", include_str!("../shaders/gather.wgsl")),
-    ("linear", include_str!("../shaders/linear.wgsl")),
-    ("max_pool", include_str!("../shaders/max_pool.wgsl")),
-    ("mean", include_str!("../shaders/mean.wgsl")),
-    ("normalise", include_str!("../shaders/normalise.wgsl")),
-    ("project", include_str!("../shaders/project.wgsl")),
-    ("relu", include_str!("../shaders/relu.wgsl")),
-    ("resize", include_str!("../shaders/resize.wgsl")),
-    ("upsample", include_str!("../shaders/upsample.wgsl")),
-    ("window_attention", include_str!("../shaders/window_attention.wgsl")),
-];
+const SHADERS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/shaders");
 
 /// Invocations of a workgroup, in every shader.
 const GROUP: u32 = 64;
@@ -172,7 +152,8 @@ impl Gpu {
     }
 
     fn compile(&self, name: &str) -> wgpu::ComputePipeline {
-        let (_, source) = SHADERS.into_iter().find(|s| s.0 == name).unwrap_or_else(|| panic!("no shader {name}"));
+        let path = format!("{SHADERS}/{name}.wgsl");
+        let source = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"));
         let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(name),
             source: wgpu::ShaderSource::Wgsl(source.into()),

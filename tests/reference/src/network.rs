@@ -5,11 +5,12 @@ use crate::ops::{self, HeadWeights, Matrix, Norm, Tensor, Walk};
 use crate::{Failure, projection};
 use safetensors::Dtype;
 use std::collections::BTreeMap;
-use voxcast::graph::{self, Graph, Op, Operation, Recipe, Scope};
+use voxcast::graph::ops::{Gather, Shader};
+use voxcast::graph::{self, Graph, Lifetime, Op, Operation, Results, Scope, Space};
 use voxcast::import::Source;
 use voxcast::{Network, Scene};
 
-/// Side of an attention window, at most (SPEC of EfficientViT, arXiv 2305.07027).
+/// Side of an attention window, at most (EfficientViT, arXiv 2305.07027).
 const WINDOW: usize = 7;
 
 /// A named result in the layout of the golden cases: channels first, a leading 1 or the cameras; logits channels last.
@@ -48,26 +49,26 @@ pub fn run(
 ) -> Result<Vec<Stage>, Failure> {
     scene.check(network)?;
     let matrices = matrices.unwrap_or_else(|| projection::matrices(gpu, network, &scene.lidar2img));
-    let graph = Graph::build(network, true);
+    let graph = Graph::build(network, Results::ALL);
     let mut walk = Run { gpu, graph: &graph, weights, matrices: &matrices, frame: BTreeMap::new(), stages: vec![] };
     let mut features: Vec<BTreeMap<usize, Tensor>> = vec![];
     for image in &scene.images {
         let mut tensors = BTreeMap::new();
         for operation in &graph.operations[..graph.camera_operations] {
-            if operation.op == Op::Normalise {
+            if let Op::Normalise(_) = operation.op {
                 let image = ops::normalise(gpu, &image.bgr, [image.height, image.width], network.image);
-                walk.keep(operation, &image, true);
-                tensors.insert(operation.output.0, image);
+                walk.keep(operation, &image);
+                tensors.insert(operation.output().0, image);
             } else {
-                walk.operation(operation, &mut tensors, &[], true)?;
+                walk.operation(operation, &mut tensors, &[])?;
             }
         }
-        tensors.retain(|&id, _| graph.tensors[id].scope == Scope::Features);
+        tensors.retain(|&id, _| graph.tensors[id].lifetime == Lifetime::Camera);
         features.push(tensors);
     }
     let mut tensors = std::mem::take(&mut walk.frame);
     for operation in &graph.operations[graph.camera_operations..] {
-        walk.operation(operation, &mut tensors, &features, false)?;
+        walk.operation(operation, &mut tensors, &features)?;
     }
     let mut stages = walk.stages;
     for (level, pair) in matrices.iter().enumerate() {
@@ -100,18 +101,24 @@ impl Run<'_> {
         operation: &Operation,
         tensors: &mut BTreeMap<usize, Tensor>,
         features: &[BTreeMap<usize, Tensor>],
-        camera: bool,
     ) -> Result<(), Failure> {
         let input = |i: usize| &tensors[&operation.inputs[i].0];
-        let mut y = match operation.op {
-            Op::Gather { level, matrix, first_channel: 0, bias: false } => {
+        let mut y = match (&operation.op, operation.op.description().shader(&self.graph.site(operation))) {
+            (_, Some(shader)) => self.shader(operation, &shader, &input)?,
+            (Op::WindowAttention(attention), None) => {
+                self.attention(&operation.name, input(0), attention.shape.heads, attention.shape.key_dim)?
+            }
+            (&Op::Gather(Gather { level, matrix, first_channel: 0 }), None) => {
                 let maps: Vec<&Tensor> = features.iter().map(|f| &f[&operation.inputs[0].0]).collect();
                 let index = usize::from(matrix == graph::Matrix::Bev);
-                let extent = self.graph.tensor(operation.output).extent;
+                let extent = self.graph.tensor(operation.output()).extent;
                 ops::gather(self.gpu, &self.matrices[level][index], &maps, extent)
             }
-            Op::Head { level } => return self.head(operation, level, input(0)),
-            _ => self.compute(operation, &input)?,
+            (Op::Head(head), None) => return self.head(operation, head.classes, input(0)),
+            (op, None) => {
+                let message = format!("{}: {op:?} has no shader and is not composed of others", operation.name);
+                return Err(Failure(message));
+            }
         };
         let residual = operation.residual.map(|r| (&tensors[&r.tensor.0], r.after));
         if let Some((residual, false)) = residual {
@@ -123,81 +130,50 @@ impl Run<'_> {
         if let Some((residual, true)) = residual {
             y = ops::add(self.gpu, &y, residual);
         }
-        let output = self.graph.tensor(operation.output);
+        let output = self.graph.tensor(operation.output());
         if operation.channels == output.channels {
-            tensors.insert(operation.output.0, y.clone());
+            tensors.insert(operation.output().0, y.clone());
         } else {
             // Branches side by side in one tensor.
-            let wide = tensors.entry(operation.output.0).or_insert_with(|| Tensor {
+            let wide = tensors.entry(operation.output().0).or_insert_with(|| Tensor {
                 extent: output.extent,
                 channels: output.channels,
                 buffer: self.gpu.zeros(output.len()),
             });
             wide.write(self.gpu, operation.first_channel, &y);
         }
-        self.keep(operation, &y, camera);
+        self.keep(operation, &y);
         Ok(())
     }
 
-    /// The operation itself, without what follows it.
-    fn compute<'t>(&self, operation: &Operation, input: &dyn Fn(usize) -> &'t Tensor) -> Result<Tensor, Failure> {
+    /// The operation itself, without what follows it: the shader that its description names.
+    fn shader<'t>(
+        &self,
+        operation: &Operation,
+        shader: &Shader,
+        input: &dyn Fn(usize) -> &'t Tensor,
+    ) -> Result<Tensor, Failure> {
         let gpu = self.gpu;
-        let channels = operation.channels;
-        Ok(match &operation.op {
-            Op::Conv { geometry } => {
-                let x = input(0);
-                let walk = Walk {
-                    kernel: geometry.kernel,
-                    stride: geometry.stride,
-                    dilation: geometry.dilation,
-                    padding: geometry.padding,
-                };
-                let Recipe::Conv(names) = &operation.recipe else { return Err(foreign(operation)) };
-                let [d, h, w] = geometry.kernel;
-                // The published modules are Conv3d here and Conv2d elsewhere.
-                let solid = ["down_conv3d", "refine_lvl"].iter().any(|part| names.prefix.contains(part));
-                let shape = if solid { vec![channels, x.channels, d, h, w] } else { vec![channels, x.channels, h, w] };
-                let weight = self.load(&format!("{}.weight", names.prefix), &shape)?;
-                let bias = match names.bias {
-                    true => Some(self.load(&format!("{}.bias", names.prefix), &[channels])?),
-                    false => None,
-                };
-                ops::conv(gpu, x, &walk, &weight, bias.as_ref())
-            }
-            Op::DeformConv { .. } => {
-                let x = input(0);
-                let weight = self.load(&format!("{}.weight", operation.name), &[channels, x.channels, 3, 3])?;
-                ops::deform_conv(gpu, x, input(1), &weight)
-            }
-            Op::Depthwise { side } => {
-                let x = input(0);
-                let weight = self.load(&format!("{}.weight", operation.name), &[channels, 1, *side, *side])?;
-                ops::depthwise(gpu, x, *side, [x.extent[1], x.extent[2]], &weight)
-            }
-            Op::BatchNorm => {
-                let x = input(0).slice(gpu, operation.first_channel, channels);
-                ops::batch_norm(gpu, &x, &self.norm(&operation.name, channels)?)
-            }
-            Op::MaxPool { side, stride, padding } => ops::max_pool(gpu, input(0), *side, *stride, *padding),
-            Op::UpsampleAdd => {
-                let x = input(0);
-                ops::add(gpu, x, &ops::upsample(gpu, input(1), [x.extent[1], x.extent[2]]))
-            }
-            Op::Deconv => {
-                let x = input(0);
-                let weight = self.load(&format!("{}.weight", operation.name), &[x.channels, channels, 4, 4, 4])?;
-                ops::deconv(gpu, x, &weight, &self.load(&format!("{}.bias", operation.name), &[channels])?)
-            }
-            Op::WindowAttention { shape } => self.attention(&operation.name, input(0), shape.heads, shape.key_dim)?,
-            Op::Gate => {
-                let weight = self.load(&format!("{}.weight", operation.name), &[1, channels, 1, 1, 1])?;
-                let bias = self.load(&format!("{}.bias", operation.name), &[1])?;
-                ops::gate(gpu, input(0), input(1), &weight, &bias)
-            }
-            Op::GlobalMean => ops::mean(gpu, input(0)),
-            Op::Broadcast => ops::broadcast(gpu, input(0), self.graph.tensor(operation.output).extent),
-            Op::Normalise | Op::Gather { .. } | Op::Head { .. } => return Err(foreign(operation)),
-        })
+        let in_place = operation.op.description().in_place();
+        let mut buffers = vec![];
+        for i in 0..operation.inputs.len() {
+            let x = input(i);
+            // What works in place on some channels of a wide tensor reads only those.
+            let whole = in_place != Some(i) || x.channels == operation.channels;
+            let part = (!whole).then(|| x.slice(gpu, operation.first_channel, operation.channels));
+            buffers.push(part.as_ref().unwrap_or(x).buffer.clone());
+        }
+        for (name, shape) in &shader.weights {
+            buffers.push(match name {
+                Some(name) => self.load(name, shape)?,
+                None => gpu.zeros(1),
+            });
+        }
+        let words: Vec<u32> = shader.shape.iter().map(|&v| u32::try_from(v).expect("shapes fit 32 bits")).collect();
+        let extent = self.graph.tensor(operation.output()).extent;
+        let buffers: Vec<&Buffer> = buffers.iter().collect();
+        let len = extent.iter().product::<usize>() * operation.channels;
+        Ok(Tensor { extent, channels: operation.channels, buffer: gpu.run(shader.name, &words, &buffers, len) })
     }
 
     fn attention(&self, prefix: &str, x: &Tensor, heads: usize, dim: usize) -> Result<Tensor, Failure> {
@@ -223,31 +199,31 @@ impl Run<'_> {
         Ok(ops::window_attention(self.gpu, x, WINDOW, &weights, &proj))
     }
 
-    fn head(&mut self, operation: &Operation, level: usize, x: &Tensor) -> Result<(), Failure> {
+    fn head(&mut self, operation: &Operation, classes: usize, x: &Tensor) -> Result<(), Failure> {
         let layer = |i: usize, outputs: usize| -> Result<[Buffer; 2], Failure> {
             let weight = self.load(&format!("{}.{i}.weight", operation.name), &[outputs, x.channels])?;
             Ok([weight, self.load(&format!("{}.{i}.bias", operation.name), &[outputs])?])
         };
-        let layers = [layer(0, x.channels)?, layer(2, x.channels)?, layer(4, operation.channels)?];
-        let (logits, classes) = ops::head(self.gpu, x, &layers);
+        let layers = [layer(0, x.channels)?, layer(2, x.channels)?, layer(4, classes)?];
+        let (logits, largest) = ops::head(self.gpu, x, &layers);
         if let Some(name) = &operation.stage {
-            let shape = x.extent.into_iter().chain([operation.channels]).collect();
+            let shape = x.extent.into_iter().chain([classes]).collect();
             let bytes = floats(&self.gpu.read::<f32>(&logits));
             self.stages.push(Stage { name: name.clone(), dtype: Dtype::F32, shape, bytes });
         }
-        if level == 0 {
+        if self.graph.tensor(operation.output()).scope == Scope::Output {
             self.stages.push(Stage {
                 name: "classes".to_owned(),
                 dtype: Dtype::U8,
                 shape: x.extent.to_vec(),
-                bytes: self.gpu.read::<u32>(&classes).iter().map(|&c| c as u8).collect(),
+                bytes: self.gpu.read::<u32>(&largest).iter().map(|&c| c as u8).collect(),
             });
         }
         Ok(())
     }
 
     /// Reads a stage back. Those of cameras follow one another.
-    fn keep(&mut self, operation: &Operation, tensor: &Tensor, camera: bool) {
+    fn keep(&mut self, operation: &Operation, tensor: &Tensor) {
         let Some(name) = &operation.stage else { return };
         let bytes = floats(&self.gpu.read::<f32>(&tensor.buffer));
         if let Some(stage) = self.stages.iter_mut().find(|s| s.name == *name) {
@@ -255,8 +231,10 @@ impl Run<'_> {
             stage.bytes.extend(bytes);
             return;
         }
-        let solid = ["volume", "fused"].iter().any(|part| name.contains(part));
-        let extent = if camera || !solid { &tensor.extent[1..] } else { &tensor.extent[..] };
+        let extent = match self.graph.tensor(operation.output()).space {
+            Space::Volume => &tensor.extent[..],
+            Space::Image | Space::Plane => &tensor.extent[1..],
+        };
         let shape = [1, tensor.channels].into_iter().chain(extent.iter().copied()).collect();
         self.stages.push(Stage { name: name.clone(), dtype: Dtype::F32, shape, bytes });
     }
@@ -275,10 +253,6 @@ impl Run<'_> {
         let numbers: Vec<f32> = self.weights.tensor(name, shape)?.into_iter().map(|v| v as f32).collect();
         Ok(self.gpu.upload(&numbers))
     }
-}
-
-fn foreign(operation: &Operation) -> Failure {
-    Failure(format!("{}: {:?} is no operation of an unrewritten graph", operation.name, operation.op))
 }
 
 fn floats(values: &[f32]) -> Vec<u8> {

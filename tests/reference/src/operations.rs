@@ -51,7 +51,7 @@ fn result(gpu: &Gpu, case: &Case) -> Vec<f32> {
         }
         Kind::UpsampleAdd { low, size, channels } => {
             let small = tensor("low", [1, low[0], low[1]], channels);
-            ops::add(gpu, &tensor("x", [1, size[0], size[1]], channels), &ops::upsample(gpu, &small, size))
+            ops::upsample_add(gpu, &tensor("x", [1, size[0], size[1]], channels), &small)
         }
         Kind::Gather { rows, cameras, pixels, channels } => {
             let (ptr, col) = case.matrix(rows, cameras * pixels);

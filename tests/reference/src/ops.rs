@@ -152,11 +152,12 @@ pub fn max_pool(gpu: &Gpu, x: &Tensor, side: usize, stride: usize, padding: usiz
     Tensor::of([1, out_height, out_width], x.channels, buffer)
 }
 
-/// `low` enlarged to `height` x `width`.
-pub fn upsample(gpu: &Gpu, low: &Tensor, [height, width]: [usize; 2]) -> Tensor {
-    let shape = words([low.channels, low.extent[1], low.extent[2], height, width]);
-    let buffer = gpu.run("upsample", &shape, &[&low.buffer], low.channels * height * width);
-    Tensor::of([1, height, width], low.channels, buffer)
+/// `x` and `low`, enlarged to the size of `x`.
+pub fn upsample_add(gpu: &Gpu, x: &Tensor, low: &Tensor) -> Tensor {
+    let [_, height, width] = x.extent;
+    let shape = words([x.channels, low.extent[1], low.extent[2], height, width]);
+    let buffer = gpu.run("upsample_add", &shape, &[&x.buffer, &low.buffer], x.len());
+    Tensor::of(x.extent, x.channels, buffer)
 }
 
 /// A sparse matrix whose entries are all one.
@@ -229,7 +230,7 @@ pub struct HeadWeights {
 }
 
 /// Cascaded group attention (arXiv 2305.07027) within windows of at most `side` x `side`: padded with zeros at the ends,
-/// head after head, each with the result of the one before added to its share of the channels; then a rectifier, a 1x1
+/// head after head, each with the result of the one before added to its share of the channels; then a ReLU, a 1x1
 /// convolution and its norm, cropped and added to `x`.
 pub fn window_attention(
     gpu: &Gpu,
@@ -281,7 +282,7 @@ pub fn normalise(gpu: &Gpu, bgr: &[u8], [height, width]: [usize; 2], padded: [us
     Tensor::of([1, padded[0], padded[1]], 3, buffer)
 }
 
-/// Three linear layers with rectifiers between; `[weight, bias]` of each. Logits `[positions, classes]`, and the classes.
+/// Three linear layers with ReLUs between; `[weight, bias]` of each. Logits `[positions, classes]`, and the classes.
 pub fn head(gpu: &Gpu, x: &Tensor, layers: &[[Buffer; 2]; 3]) -> (Buffer, Buffer) {
     let positions = x.positions();
     let layer = |x: &Buffer, [weight, bias]: &[Buffer; 2], last: bool| {

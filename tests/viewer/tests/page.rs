@@ -6,6 +6,7 @@ use tempfile::TempDir;
 use voxcast::Scene;
 use voxcast::eval::Confusion;
 use voxcast::html::Page;
+use voxcast::network::Grid;
 use voxcast::picture::{Class, Occupancy, Palette};
 use voxcast::scene::Image;
 use voxcast::synth::Synthesiser;
@@ -98,7 +99,7 @@ impl World {
 
     /// The page as a file.
     fn write(&self) -> PathBuf {
-        let prediction = Occupancy::new("", &self.classes, self.grid, self.bounds, self.forward).unwrap();
+        let prediction = Occupancy::new("", &self.classes, Grid::new(self.grid, self.bounds), self.forward).unwrap();
         let page = Page {
             title: &self.title,
             subtitle: "of a test",

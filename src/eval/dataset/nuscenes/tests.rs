@@ -2,7 +2,7 @@ use super::super::{Axes, IGNORED};
 use super::*;
 use crate::base::error::ErrorKind;
 use crate::file::npz::{Array, Elements, write_npz};
-use crate::show::picture::write_rgb_png;
+use crate::image::png::write_rgb_png;
 use serde_json::{Value, json};
 use std::fs;
 

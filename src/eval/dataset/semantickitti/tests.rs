@@ -1,6 +1,6 @@
 use super::*;
 use crate::base::error::ErrorKind;
-use crate::show::picture::write_rgb_png;
+use crate::image::png::write_rgb_png;
 use std::fs;
 
 const VOXELS: usize = 256 * 256 * 32;

@@ -1,4 +1,5 @@
 use super::*;
+use crate::network::Grid;
 
 const PAGE: [u8; 3] = [255; 3];
 
@@ -12,7 +13,8 @@ fn scene(voxels: &[([usize; 3], u8)]) -> Vec<u8> {
 
 /// The frame lies far from the vehicle, so that no car is drawn.
 fn view(classes: &[u8]) -> Occupancy<'_> {
-    Occupancy::new("", classes, [20, 20, 8], [[100.0, 110.0], [100.0, 110.0], [0.0, 4.0]], [0.0, 1.0]).unwrap()
+    Occupancy::new("", classes, Grid::new([20, 20, 8], [[100.0, 110.0], [100.0, 110.0], [0.0, 4.0]]), [0.0, 1.0])
+        .unwrap()
 }
 
 fn red_pixels(rgb: &[u8], w: usize) -> Vec<[usize; 2]> {
@@ -29,8 +31,8 @@ fn voxel_lands_where_the_camera_projects_it() {
         let rgb = render(&view(&classes), &palette, w, h, PAGE);
         let found = red_pixels(&rgb, w);
         assert!(found.len() > 20, "{voxel:?}: {} red pixels", found.len());
-        let grid = Grid::new(&view(&classes), &palette);
-        let camera = View::new(&grid, grid.floor(), w * SAMPLES, h * SAMPLES);
+        let grid = Cells::new(&view(&classes), &palette);
+        let camera = Viewpoint::new(&grid, grid.floor(), w * SAMPLES, h * SAMPLES);
         let middle = grid.low + grid.step * Vec3::from_array(voxel.map(|v| v as f32 + 0.5));
         let expected = camera.project(middle.as_dvec3()).map(|v| v / SAMPLES as f64);
         let mean = [0, 1].map(|k| found.iter().map(|p| p[k] as f64 + 0.5).sum::<f64>() / found.len() as f64);
@@ -89,7 +91,7 @@ fn seams_between_faces_do_not_show() {
 fn shade_falls_away_from_the_sun() {
     let palette = Palette::of(17);
     let classes = scene(&[([10, 10, 0], 4), ([10, 10, 1], 4), ([10, 10, 2], 4)]);
-    let grid = Grid::new(&view(&classes), &palette);
+    let grid = Cells::new(&view(&classes), &palette);
     let foot = grid.low + grid.step * Vec3::new(10.5, 10.5, 0.02);
     let beside = |x: f32, y: f32| grid.is_shaded(foot + grid.step * Vec3::new(x, y, 0.0), grid.sun);
     // The sun stands to the rear left: the shadow falls ahead and to the right.

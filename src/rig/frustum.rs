@@ -1,10 +1,10 @@
 //! A camera as the builder sees it: its projection, and which boxes it cannot see.
 
-use super::build::Level;
+use super::level::LevelGrid;
 use voxcast_kernels::project::{Projection, Sum};
 
 /// A camera at one level, with the test that rules it out for boxes it cannot see.
-pub(super) struct View {
+pub(super) struct Frustum {
     pub(super) projection: Projection,
     /// Linear forms of (x, y, z, 1), none of which is negative where a sample counts: p2, p0, p1, (W - 1) p2 - p0 and
     /// (H - 1) p2 - p1.
@@ -13,8 +13,8 @@ pub(super) struct View {
     last: [f64; 2],
 }
 
-impl View {
-    pub(super) fn new(level: &Level, cameras: usize, camera: usize, m: &[f32; 16]) -> Self {
+impl Frustum {
+    pub(super) fn new(level: &LevelGrid, cameras: usize, camera: usize, m: &[f32; 16]) -> Self {
         let projection = Projection {
             matrix: std::array::from_fn(|i| m[i]),
             sum: if cameras == 1 { Sum::Pairs } else { Sum::Chain },
@@ -56,8 +56,8 @@ mod tests {
     use super::*;
     use crate::network::Network;
 
-    fn level() -> Level {
-        Level::new(&Network::built_in("nuscenes-200").unwrap(), 0)
+    fn level() -> LevelGrid {
+        LevelGrid::new(&Network::built_in("nuscenes-200").unwrap(), 0)
     }
 
     /// Looks along x from the origin, 800 pixels of focal length.
@@ -65,7 +65,7 @@ mod tests {
 
     #[test]
     fn the_bounding_test_rules_out_what_is_behind_or_beside() {
-        let view = View::new(&level(), 6, 0, &AHEAD);
+        let view = Frustum::new(&level(), 6, 0, &AHEAD);
         let z = [-5.0, 3.0];
         for (x, y, expected, why) in [
             ([10.0, 11.0], [0.0, 1.0], true, "ahead"),
@@ -87,7 +87,7 @@ mod tests {
         for (i, value) in [(0, f32::NAN), (5, f32::INFINITY), (8, f32::NEG_INFINITY), (2, 1e30), (11, f32::NAN)] {
             let mut m = AHEAD;
             m[i] = value;
-            assert!(View::new(&level(), 6, 0, &m).may_see(&behind), "{value} at {i}");
+            assert!(Frustum::new(&level(), 6, 0, &m).may_see(&behind), "{value} at {i}");
         }
     }
 }

@@ -7,7 +7,7 @@ use glam::Vec3;
 const LIDAR_HEIGHT: f32 = 1.8;
 
 /// Drawn voxels of an occupancy, in its own row-major order.
-pub(crate) struct Grid {
+pub(crate) struct Cells {
     /// Class of each voxel; 0 where nothing is drawn.
     pub(crate) cells: Vec<u8>,
     /// Whether no camera sees a voxel; empty if that is not known.
@@ -27,20 +27,20 @@ pub(crate) struct Grid {
     sunlit: Vec<f32>,
 }
 
-/// How far rays to the sun may lean away from [`Grid::sun`], in each direction of the plane.
+/// How far rays to the sun may lean away from [`Cells::sun`], in each direction of the plane.
 pub(crate) const SUN_DISC: f32 = 0.045;
 
 /// Most steps that the search for sunlit layers may take.
 const MAX_SEARCH: usize = 1 << 26;
 
-impl Grid {
+impl Cells {
     pub(crate) fn new(occupancy: &Occupancy<'_>, palette: &Palette) -> Self {
-        let size = occupancy.grid;
+        let size = occupancy.grid.size;
         let cells: Vec<u8> = occupancy.classes.iter().map(|&c| if palette.is_drawn(c) { c } else { 0 }).collect();
         let unseen = (0..occupancy.support.len()).map(|i| occupancy.is_unseen(i)).collect();
         let layers = cells.chunks_exact(size[2]);
         let top = layers.filter_map(|column| column.iter().rposition(|&c| c != 0)).max().map_or(0, |z| z + 1);
-        let bounds = occupancy.bounds;
+        let bounds = occupancy.grid.bounds;
         let axis = |k: usize| Vec3::from_array(bounds.map(|b| b[k]));
         let low = axis(0);
         let step = (axis(1) - low) / Vec3::from_array(size.map(|n| n as f32));
@@ -212,6 +212,7 @@ fn left_of(ahead: Vec3) -> Vec3 {
 mod tests {
     use super::*;
     use crate::base::random::Random;
+    use crate::network::Grid;
 
     #[test]
     fn the_search_for_sunlit_layers_changes_no_shadow() {
@@ -220,8 +221,8 @@ mod tests {
             let classes: Vec<u8> =
                 (0..size.iter().product::<usize>()).map(|_| u8::from(random.below(9) == 0)).collect();
             let bounds = [[-3.0, 3.0], [-2.0, 4.0], [-1.0, 2.0]];
-            let occupancy = Occupancy::new("", &classes, size, bounds, forward).unwrap();
-            let mut grid = Grid::new(&occupancy, &Palette::of(2));
+            let occupancy = Occupancy::new("", &classes, Grid::new(size, bounds), forward).unwrap();
+            let mut grid = Cells::new(&occupancy, &Palette::of(2));
             let found = std::mem::take(&mut grid.sunlit);
             let mut shaded = 0;
             for _ in 0..20_000 {

@@ -1,0 +1,86 @@
+//! The occupancy head: three linear layers and the largest class.
+
+use super::description::{Description, Machine, wide};
+use crate::base::error::Result;
+use crate::graph::call::{Call, Tile};
+use crate::graph::parts::Part;
+use crate::graph::recipe::{ConvNames, Recipe};
+use crate::graph::site::Site;
+use crate::graph::weights::{Values, Weights, packed, padded};
+use voxcast_kernels::LANES;
+use voxcast_kernels::head::{Head as Kernel, head, scratch_len};
+use voxcast_kernels::panels::packed_len;
+
+/// Voxels that one worker classifies at a time.
+const VOXELS: usize = 960;
+
+/// [`voxcast_kernels::head`]: x. Writes a class per voxel, and logits where the graph has a tensor for them.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Head {
+    /// Classes.
+    pub classes: usize,
+}
+
+impl Head {
+    /// Columns of the three layers.
+    fn columns(&self, site: &Site<'_>) -> [usize; 3] {
+        let channels = site.input(0).channels;
+        [channels, channels, self.classes]
+    }
+}
+
+impl Description for Head {
+    fn kind(&self) -> &'static str {
+        "head"
+    }
+
+    fn parts(&self, site: &Site<'_>) -> Vec<Part> {
+        let channels = site.input(0).channels;
+        let suffixes = [["0.weight", "0.bias"], ["1.weight", "1.bias"], ["2.weight", "2.bias"]];
+        let layers = suffixes.into_iter().zip(self.columns(site));
+        layers
+            .flat_map(|([weight, bias], columns)| {
+                let padded = columns.next_multiple_of(LANES);
+                [Part::panels(weight, packed_len(channels, columns)), Part::plain(bias, padded)]
+            })
+            .collect()
+    }
+
+    fn evaluate(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
+        let Recipe::Module(prefix) = site.recipe else { unreachable!("a head, not {:?}", site.recipe) };
+        let channels = site.input(0).channels;
+        let mut values = vec![];
+        // ReLUs stand between the layers.
+        for (layer, columns) in [0, 2, 4].into_iter().zip(self.columns(site)) {
+            let names = ConvNames { prefix: format!("{prefix}.{layer}"), bias: true, norm: None };
+            let dense = weights.dense(&names, &[columns, channels], columns)?;
+            values.extend([packed(&dense.weight, channels, columns), padded(dense.bias)]);
+        }
+        Ok(values)
+    }
+
+    fn scratch(&self, site: &Site<'_>) -> usize {
+        scratch_len(site.input(0).channels, self.classes) * size_of::<f32>()
+    }
+
+    fn multiply_adds(&self, site: &Site<'_>) -> u128 {
+        let channels = site.input(0).channels;
+        wide(site.rows()) * wide(channels) * wide(2 * channels + self.classes)
+    }
+
+    fn tile(&self, _: &Site<'_>, _: Machine) -> usize {
+        VOXELS
+    }
+
+    fn execute(&self, call: &Call<'_>, mut tile: Tile<'_>) {
+        let args = Kernel {
+            input: call.input(0),
+            channels: call.site.input(0).channels,
+            classes: self.classes,
+            weights: [0, 2, 4].map(|i| call.parts[i].panels()),
+            biases: [1, 3, 5].map(|i| call.part(i)),
+        };
+        let logits = (call.site.outputs.len() > 1).then(|| tile.output(1));
+        head(call.isa, &args, tile.positions.clone(), tile.output(0), logits, tile.scratch());
+    }
+}

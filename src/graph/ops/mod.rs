@@ -1,0 +1,68 @@
+//! The operations: a file for each, and the list of all.
+
+mod description;
+
+mod batch_norm;
+mod broadcast;
+mod conv;
+mod deconv;
+mod deform_conv;
+mod depthwise;
+mod gate;
+mod gather;
+mod global_mean;
+mod head;
+mod max_pool;
+mod normalise;
+mod product;
+mod upsample_add;
+mod window_attention;
+
+pub use description::{Description, Machine, Shader};
+
+/// Makes the type [`Op`] of a list of descriptions.
+macro_rules! operations {
+    ($($module:ident::$Name:ident),* $(,)?) => {
+        $(pub use $module::$Name;)*
+
+        /// What an operation computes: one of the descriptions.
+        #[derive(Clone, Debug, PartialEq, Eq)]
+        pub enum Op {
+            $(#[doc = concat!("See [`struct@", stringify!($Name), "`].")] $Name($Name),)*
+        }
+
+        impl Op {
+            /// All that is to be known of it.
+            pub fn description(&self) -> &dyn Description {
+                match self {
+                    $(Op::$Name(description) => description,)*
+                }
+            }
+        }
+
+        $(
+            impl From<$Name> for Op {
+                fn from(description: $Name) -> Self {
+                    Op::$Name(description)
+                }
+            }
+        )*
+    };
+}
+
+operations! {
+    normalise::Normalise,
+    conv::Conv,
+    deform_conv::DeformConv,
+    depthwise::Depthwise,
+    batch_norm::BatchNorm,
+    max_pool::MaxPool,
+    upsample_add::UpsampleAdd,
+    gather::Gather,
+    deconv::Deconv,
+    window_attention::WindowAttention,
+    gate::Gate,
+    global_mean::GlobalMean,
+    broadcast::Broadcast,
+    head::Head,
+}
