@@ -47,7 +47,11 @@ impl View {
         frame::check_output(&output)?;
         let network = self.network.as_deref().map(read_network).transpose()?;
         let stored = Stored::read(&self.result, network.as_ref()).map_err(|e| e.in_file(&self.result))?;
-        let scene = self.scene.as_deref().map(Scene::open).transpose()?;
+        let scene = self.scene.as_deref().map(Scene::open_with_notes).transpose()?;
+        let scene = scene.map(|(scene, notes)| {
+            terminal::say(&notes);
+            scene
+        });
         let truth = self.truth.as_deref().map(|path| read_labels(path, stored.grid)).transpose()?;
         let occupancy = stored.occupancy().map_err(|e| e.in_file(&self.result))?;
         let page = Page {

@@ -15,6 +15,7 @@
 //! show in the result.
 
 use super::axis::axis;
+use super::calibration::Calibration;
 use super::rows::{Growing, PixelSet, out_of_memory, too_many_entries};
 use super::view::View;
 use super::{Rig, Storage, Tensors};
@@ -76,6 +77,8 @@ pub struct RigBuilder {
     scratch: Vec<Mutex<Scratch>>,
     threads: Threads,
     cameras: usize,
+    /// [`Calibration`] of the rig that is under way.
+    calibration: Calibration,
     isa: Isa,
     /// Entries of each matrix so far.
     entries: [[AtomicU64; 2]; 3],
@@ -160,6 +163,7 @@ impl RigBuilder {
             scratch: vec![Mutex::default()],
             threads: Threads::calling(),
             cameras,
+            calibration: Calibration::default(),
             isa,
             entries: Default::default(),
             tensors: Tensors::default(),
@@ -184,7 +188,11 @@ impl RigBuilder {
     /// [`ErrorKind::Mismatch`] if there are not as many matrices as cameras; [`ErrorKind::TooLarge`] if a matrix has
     /// more than 2^32 - 1 entries or memory runs out.
     pub fn build(&mut self, lidar2img: &[[f32; 16]]) -> Result<Rig> {
-        let mut rig = Rig { storage: Storage::Owned(Tensors::default()), cameras: self.cameras };
+        let mut rig = Rig {
+            storage: Storage::Owned(Tensors::default()),
+            cameras: self.cameras,
+            calibration: Calibration::default(),
+        };
         self.rebuild(lidar2img, &mut rig)?;
         Ok(rig)
     }
@@ -226,6 +234,7 @@ impl RigBuilder {
             views.clear();
             views.extend(lidar2img.iter().enumerate().map(|(c, m)| View::new(level, self.cameras, c, m)));
         }
+        self.calibration.set(lidar2img);
         self.entries = Default::default();
         self.done = Some(0);
         Ok(())
@@ -268,6 +277,7 @@ impl RigBuilder {
             mapped => *mapped = Storage::Owned(std::mem::take(&mut self.tensors)),
         }
         rig.cameras = self.cameras;
+        std::mem::swap(&mut rig.calibration, &mut self.calibration);
         Ok(true)
     }
 

@@ -6,7 +6,8 @@
 
 use super::{Axes, DataSet, Frame, Grid, IGNORED, Pose, Truth};
 use crate::base::error::{Error, Result};
-use crate::scene::{Scene, check_finite, read_image};
+use crate::image::file::read_image;
+use crate::scene::{Scene, check_finite};
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -266,7 +267,7 @@ impl DataSet for SemanticKitti {
         let mut scene = Scene { names: Vec::new(), images: Vec::new(), lidar2img: Vec::new() };
         for camera in &sequence.cameras {
             let path = sequence.directory.join(camera.name).join(format!("{}.png", frame.stem()));
-            scene.images.push(read_image(&path, camera.name, None)?);
+            scene.images.push(read_image(&path, camera.name, None, &mut Vec::new())?);
             scene.names.push(camera.name.to_owned());
             scene.lidar2img.push(camera.lidar2img);
         }
