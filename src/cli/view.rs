@@ -153,10 +153,6 @@ fn palette(colours: &[[u8; 3]]) -> Palette {
 }
 
 fn unfit(array: &OwnedArray, expected: &str) -> Error {
-    let kind = match array.elements {
-        OwnedElements::U8(_) => "u8",
-        OwnedElements::U16(_) => "u16",
-        OwnedElements::F32(_) => "f32",
-    };
+    let kind = array.elements.kind();
     Error::format(format!("array {:?} is {kind} {:?}, expected {expected}", array.name, array.shape))
 }

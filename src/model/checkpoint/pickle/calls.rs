@@ -53,6 +53,10 @@ impl<'a> Machine<'a> {
             }
             Callable::FromType => {
                 let [function, class, args, ..] = parts[..] else { return Err(wrong(self)) };
+                let (callable, function) = self.callable(function)?;
+                if !matches!(callable, Callable::Tensor | Callable::TensorV3) {
+                    return Err(self.refusal(&function));
+                }
                 let &Value::Global { module, name: class } = self.get(class) else { return Err(wrong(self)) };
                 if !self.name_of(module, class).is_some_and(|(m, n)| globals::is_plain_tensor(m, n)) {
                     let class = self.quote(module, class);
@@ -60,10 +64,6 @@ impl<'a> Machine<'a> {
                         "a tensor of class {class}, expected a plain one: its elements may mean something else"
                     );
                     return Err(self.error_of(ErrorKind::Unsupported, what));
-                }
-                let (callable, function) = self.callable(function)?;
-                if !matches!(callable, Callable::Tensor | Callable::TensorV3) {
-                    return Err(self.refusal(&function));
                 }
                 let Value::Tuple(parts) = self.get(args) else { return Err(wrong(self)) };
                 let parts = parts[..parts.len().min(8)].to_vec();
