@@ -267,6 +267,18 @@ voxcast_status voxcast_model_selftest(
 voxcast_status voxcast_rig_open(
     const voxcast_model *model, const char *path, size_t cameras, voxcast_rig **rig, char *message, size_t capacity);
 
+/*
+ * Whether a rig is that of these cameras, in this order. Sessions do not ask: with the rig of another calibration a frame
+ * gathers other pixels than the scene's, without an error. Ask once, after opening a rig, where the calibration is at hand.
+ *
+ * lidar2img  per camera 16 numbers as for voxcast_rig_builder_build: the same numbers, in every bit, that it was built from.
+ * known      becomes 1 if they are, 0 if the rig does not say from which it was built, as those of other programs do not.
+ * Fails      VOXCAST_MISMATCH if it was built from others; the message says which cameras differ, or that the order does.
+ *            VOXCAST_BUSY while the rig is being built.
+ */
+voxcast_status voxcast_rig_check(
+    const voxcast_rig *rig, const float *lidar2img, size_t cameras, uint32_t *known, char *message, size_t capacity);
+
 /* Frees a rig. A session that uses its matrices keeps them. */
 void voxcast_rig_free(voxcast_rig *rig);
 

@@ -120,7 +120,7 @@ pub mod scene;
 pub mod show;
 pub mod synth;
 
-pub use base::{digest, error, random, threads};
+pub use base::{digest, error, note, random, threads};
 pub use check::{compare, selftest};
 #[cfg(feature = "eval")]
 pub use eval::dataset;
@@ -142,6 +142,7 @@ pub use error::{Error, ErrorKind, Result};
 pub use image::ImageView;
 pub use model::Model;
 pub use network::Network;
+pub use note::Note;
 pub use rig::Rig;
 pub use scene::Scene;
 pub use session::{Budget, Occupancy, Session, SessionOptions, Step};

@@ -9,13 +9,6 @@ use clap::Parser;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    // What an image's decoder stumbles over is reported as an error of that image.
-    let report = std::panic::take_hook();
-    std::panic::set_hook(Box::new(move |panic| {
-        if std::thread::current().name() != Some(voxcast::scene::DECODER_THREAD) {
-            report(panic);
-        }
-    }));
     let arguments = cli::Arguments::parse();
     match arguments.run() {
         Ok(()) => ExitCode::SUCCESS,

@@ -6,7 +6,7 @@
 
 use libfuzzer_sys::fuzz_target;
 use std::path::PathBuf;
-use std::sync::{Once, OnceLock};
+use std::sync::OnceLock;
 use voxcast::Scene;
 
 /// A directory of this process, in memory where there is one.
@@ -21,21 +21,7 @@ fn directory() -> &'static PathBuf {
     })
 }
 
-/// Panics of an image decoder are errors of the image by the time they reach a caller; others end the run.
-fn allow_decoders_to_panic() {
-    static ONCE: Once = Once::new();
-    ONCE.call_once(|| {
-        let abort = std::panic::take_hook();
-        std::panic::set_hook(Box::new(move |panic| {
-            if std::thread::current().name() != Some(voxcast::scene::DECODER_THREAD) {
-                abort(panic);
-            }
-        }));
-    });
-}
-
 fuzz_target!(|bytes: &[u8]| {
-    allow_decoders_to_panic();
     let Some((&[width, height], file)) = bytes.split_first_chunk() else { return };
     let calibration = format!(
         r#"{{"cameras":[{{"name":"a","file":"a","width":{width},"height":{height},

@@ -4,6 +4,7 @@ pub mod differential;
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
+use voxcast::checkpoint::Checkpoint;
 use voxcast::import::import;
 use voxcast::model::Options;
 use voxcast::network::{Block, Sampling};
@@ -97,4 +98,26 @@ pub fn images(network: &Network, cameras: usize) -> Vec<Vec<u8>> {
 pub fn views<'a>(network: &Network, images: &'a [Vec<u8>]) -> Vec<ImageView<'a>> {
     let [height, width] = network.image;
     images.iter().map(|bgr| ImageView::bgr(height, width, bgr)).collect()
+}
+
+/// Elements to convert for one checkpoint; an expanded view with many names would take minutes.
+const MAX_ELEMENTS: usize = 1 << 20;
+
+/// Converts the tensors of a checkpoint: each fails, or gives as many finite numbers as it has elements.
+pub fn read_all(checkpoint: &Checkpoint) {
+    let mut read = 0;
+    for name in checkpoint.names() {
+        let tensor = checkpoint.get(name).expect("a listed name");
+        read += tensor.len();
+        if read > MAX_ELEMENTS {
+            break;
+        }
+        if let Ok(values) = tensor.to_f32() {
+            assert_eq!(values.len(), tensor.shape().iter().product::<usize>());
+            assert!(values.iter().all(|v| v.is_finite()));
+        }
+        if let Ok(values) = tensor.to_f64() {
+            assert_eq!(values.len(), tensor.len());
+        }
+    }
 }

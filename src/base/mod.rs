@@ -1,6 +1,8 @@
-//! What every other room may use: errors, digests, seeded random numbers, threads.
+//! What every other room may use: errors, notes, digests, seeded random numbers, threads.
 
 pub mod digest;
 pub mod error;
+pub(crate) mod json;
+pub mod note;
 pub mod random;
 pub mod threads;

@@ -46,6 +46,29 @@ unsafe extern "C" fn voxcast_rig_open(
     unsafe { make(rig, message, capacity, body) }
 }
 
+/// # Safety
+/// The pointers are as `voxcast.h` says.
+#[unsafe(no_mangle)]
+unsafe extern "C" fn voxcast_rig_check(
+    rig: Option<&RigHandle>,
+    lidar2img: *const f32,
+    cameras: usize,
+    known: Option<&mut MaybeUninit<u32>>,
+    message: *mut c_char,
+    capacity: usize,
+) -> i32 {
+    let body = || {
+        let known = given(known, "known")?.write(0);
+        let rig = own(&given(rig, "rig")?.0, "rig")?;
+        // SAFETY: `lidar2img` is null or has 16 numbers per camera, as the header asks of the caller.
+        let matrices = unsafe { matrices(lidar2img, cameras) }?;
+        *known = u32::from(rig.check_calibration(matrices)?);
+        Ok(())
+    };
+    // SAFETY: `message` is null or has room, as the header asks of the caller.
+    unsafe { call(message, capacity, body) }
+}
+
 #[unsafe(no_mangle)]
 extern "C" fn voxcast_rig_free(rig: Option<Box<RigHandle>>) {
     free(rig);

@@ -77,11 +77,14 @@ impl Dump {
                 use crate::file::npz::OwnedElements;
                 let array = arrays.iter().find(|a| a.name == name)?;
                 let values = match &array.elements {
-                    OwnedElements::U8(v) => Values::Integers(Cow::Borrowed(v), 1),
-                    OwnedElements::U16(v) => Values::Integers(Cow::Owned(bytemuck::cast_slice(v).to_vec()), 2),
-                    OwnedElements::F32(v) => Values::Floats(Cow::Owned(bytemuck::cast_slice(v).to_vec())),
+                    OwnedElements::U8(v) => Ok(Values::Integers(Cow::Borrowed(v), 1)),
+                    OwnedElements::U16(v) => Ok(Values::Integers(Cow::Owned(bytemuck::cast_slice(v).to_vec()), 2)),
+                    OwnedElements::F32(v) => Ok(Values::Floats(Cow::Owned(bytemuck::cast_slice(v).to_vec()))),
+                    OwnedElements::Unread(what) => {
+                        Err(Error::format(format!("array \"{name}\" is {what}, expected u8, u16 or f32 in C order")))
+                    }
                 };
-                Some((array.shape.clone(), Ok(values)))
+                Some((array.shape.clone(), values))
             }
         }
     }

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use voxcast::compare::{Dump, Outcome, Stage, compare};
 use voxcast::session::views;
-use voxcast::{Error, ErrorKind, Isa, Model, Result, Scene, Session, SessionOptions};
+use voxcast::{Error, ErrorKind, Isa, Result, Session, SessionOptions};
 
 /// Compare two dumps, or two runs, and name the first stage that differs, where, and by how much.
 ///
@@ -41,6 +41,9 @@ pub struct Compare {
     /// The scene's matrices [default: built from its calibration]
     #[arg(long, requires = "model")]
     rig: Option<PathBuf>,
+    /// Use that rig even if it was made from another calibration than the scene's
+    #[arg(long, requires = "rig")]
+    any_rig: bool,
     /// The model of the other run [default: the same]
     #[arg(long, requires = "model", value_name = "MODEL")]
     against: Option<PathBuf>,
@@ -93,16 +96,22 @@ impl Compare {
         }
         other.unfolded = self.against_unfolded;
         let [a, b] = [place.0.join("a"), place.0.join("b")];
-        self.dump(model, scene, options, &a)?;
-        self.dump(self.against.as_deref().unwrap_or(model), scene, other, &b)?;
+        self.dump(model, scene, options, true, &a)?;
+        self.dump(self.against.as_deref().unwrap_or(model), scene, other, false, &b)?;
         compare(&Dump::open(&a)?, &Dump::open(&b)?, self.tolerance, common)
     }
 
-    /// Runs a scene and writes every stage that the graph has.
-    fn dump(&self, model: &Path, scene: &Path, mut options: SessionOptions, directory: &Path) -> Result<()> {
-        let (model, scene): (Arc<Model>, Scene) = frame::open(model, scene)?;
+    /// Runs a scene and writes every stage that the graph has. Notes are printed if `say`: once for two runs of one scene.
+    fn dump(&self, model: &Path, scene: &Path, mut options: SessionOptions, say: bool, directory: &Path) -> Result<()> {
+        let (model, scene, mut notes) = frame::open(model, scene)?;
         (options.logits, options.coarse_heads) = (true, true);
-        let rig = Arc::new(frame::rig(self.rig.as_deref(), &model, &scene, &options)?);
+        let file = frame::RigFile { path: self.rig.as_deref(), any: self.any_rig };
+        let (rig, of_rig) = frame::rig(file, &model, &scene, &options)?;
+        let rig = Arc::new(rig);
+        notes.extend(of_rig);
+        if say {
+            terminal::say(&notes);
+        }
         let mut session: Session = frame::session(&model, rig.clone(), &options)?;
         let graph = session.graph().clone();
         let names: Vec<&str> = graph.stages().chain(["classes"]).collect();

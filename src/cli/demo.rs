@@ -1,6 +1,7 @@
 //! `voxcast demo`
 
-use super::{Machine, frame, run, terminal};
+use super::frame::{self, RigFile};
+use super::{Machine, run, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -57,7 +58,8 @@ impl Demo {
         println!("street of seed {} drawn in {}", self.seed, terminal::time(start.elapsed()));
 
         let start = Instant::now();
-        let rig = Arc::new(frame::rig(None, &model, &drawn.scene, &options)?);
+        let (rig, _) = frame::rig(RigFile::default(), &model, &drawn.scene, &options)?;
+        let rig = Arc::new(rig);
         println!("six matrices built in {}", terminal::time(start.elapsed()));
         rig.save(&directory.join("rig.safetensors"), network)?;
 

@@ -1,20 +1,35 @@
 //! What commands share that run frames: model, scene, rig and session from files.
 
-use super::Machine;
+use super::{Machine, terminal};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use voxcast::camera::{Camera, read_calibration_with_notes};
 use voxcast::rig::RigBuilder;
-use voxcast::{Error, ErrorKind, Model, Result, Rig, Scene, Session, SessionOptions};
+use voxcast::{Error, ErrorKind, Model, Network, Note, Result, Rig, Scene, Session, SessionOptions};
 
-/// Calibration of a scene directory, of its calibration.json alone, or of a scene file.
-pub fn calibration(path: &Path) -> Result<Vec<[f32; 16]>> {
+/// Names and matrices of the cameras.
+pub type Cameras = (Vec<String>, Vec<[f32; 16]>);
+
+/// The cameras of a calibration.json; what in it is not used is said.
+pub fn cameras(path: &Path) -> Result<Vec<Camera>> {
+    let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, "read", &e))?;
+    let (cameras, notes) = read_calibration_with_notes(&text).map_err(|e| e.in_file(path))?;
+    terminal::say(&notes.into_iter().map(|note| note.in_file(path)).collect::<Vec<_>>());
+    Ok(cameras)
+}
+
+/// Cameras of a scene directory, of its calibration.json alone, or of a scene file, whose images are of the size that
+/// `network` takes.
+pub fn calibration(path: &Path, network: &Network) -> Result<Cameras> {
     if path.extension().is_some_and(|e| e == "json") {
-        let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, "read", &e))?;
-        let cameras = voxcast::camera::read_calibration(&text).map_err(|e| e.in_file(path))?;
-        return Ok(cameras.into_iter().map(|c| c.lidar2img).collect());
+        let cameras = cameras(path)?;
+        cameras.iter().try_for_each(|camera| camera.check(network)).map_err(|e| e.in_file(path))?;
+        return Ok(cameras.into_iter().map(|c| (c.name, c.lidar2img)).unzip());
     }
-    Ok(Scene::open(path)?.lidar2img)
+    let (scene, notes) = read(path, network)?;
+    terminal::say(&notes);
+    Ok((scene.names, scene.lidar2img))
 }
 
 /// Refuses a place that cannot be written, before a long computation rather than after.
@@ -27,8 +42,41 @@ pub fn check_output(path: &Path) -> Result<()> {
     }
 }
 
-/// The rig from its file, or built from the scene's calibration.
-pub fn rig(path: Option<&Path>, model: &Model, scene: &Scene, options: &SessionOptions) -> Result<Rig> {
+/// Which rig a command uses.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct RigFile<'a> {
+    /// Its file; none where it is built from the scene's calibration.
+    pub path: Option<&'a Path>,
+    /// Whether it may be of another calibration.
+    pub any: bool,
+}
+
+/// The rig from its file, or built from the scene's calibration, and what is to be said of it.
+pub fn rig(file: RigFile<'_>, model: &Model, scene: &Scene, options: &SessionOptions) -> Result<(Rig, Vec<Note>)> {
+    let rig = open_rig(file.path, model, scene, options)?;
+    let mut notes = Vec::new();
+    if let Some(path) = file.path {
+        match rig.check_calibration(&scene.lidar2img) {
+            Ok(true) => {}
+            Ok(false) => notes.push(Note::new("a rig that does not say of which calibration it is; used as it is")),
+            Err(e) if file.any => notes.push(Note::new(format!("{}; used because of --any-rig", e.message()))),
+            Err(e) => {
+                let hint = "leave --rig out to build the scene's own, or use this one with --any-rig";
+                return Err(Error::new(e.kind(), format!("{}; {hint}", e.message())).in_file(path));
+            }
+        }
+        notes.iter_mut().for_each(|note| *note = note.clone().in_file(path));
+    }
+    notes.extend(implausible(&rig, model.network(), &scene.names));
+    Ok((rig, notes))
+}
+
+/// What is to be said of a rig whose cameras see too little.
+pub fn implausible(rig: &Rig, network: &Network, names: &[String]) -> Vec<Note> {
+    rig.visibility(network).notes(names)
+}
+
+fn open_rig(path: Option<&Path>, model: &Model, scene: &Scene, options: &SessionOptions) -> Result<Rig> {
     match path {
         Some(path) => Rig::open(path, model.network(), scene.cameras()),
         None => {
@@ -60,14 +108,17 @@ pub struct Moving {
     /// How many rigs it had, and how long building them took.
     pub rigs: usize,
     pub rig_time: Duration,
+    /// What is to be said of the first rig.
+    pub notes: Vec<Note>,
 }
 
 impl Moving {
     /// With the rig of the first scene, from its file or built.
-    pub fn new(model: &Arc<Model>, path: Option<&Path>, scene: &Scene, options: &SessionOptions) -> Result<Self> {
+    pub fn new(model: &Arc<Model>, file: RigFile<'_>, scene: &Scene, options: &SessionOptions) -> Result<Self> {
         let start = Instant::now();
-        let rig = Arc::new(rig(path, model, scene, options)?);
+        let (rig, notes) = rig(file, model, scene, options)?;
         let rig_time = start.elapsed();
+        let rig = Arc::new(rig);
         let builder = RigBuilder::new(model.network(), scene.cameras(), options.isa);
         Ok(Self {
             session: session(model, rig, options)?,
@@ -75,6 +126,7 @@ impl Moving {
             calibration: scene.lidar2img.clone(),
             rigs: 1,
             rig_time,
+            notes,
         })
     }
 
@@ -83,12 +135,18 @@ impl Moving {
         self.calibration == scene.lidar2img
     }
 
+    /// Refuses another number of cameras than the rig's.
+    pub fn check_count(&self, scene: &Scene) -> Result<()> {
+        if self.calibration.len() == scene.cameras() {
+            return Ok(());
+        }
+        let (found, expected) = (scene.cameras(), self.calibration.len());
+        Err(Error::mismatch(format!("{found} cameras, expected {expected} as in the scenes before")))
+    }
+
     /// Builds the matrices anew if the scene's cameras have moved.
     pub fn calibrate(&mut self, scene: &Scene) -> Result<()> {
-        if self.calibration.len() != scene.cameras() {
-            let (found, expected) = (scene.cameras(), self.calibration.len());
-            return Err(Error::mismatch(format!("{found} cameras, expected {expected} as in the scenes before")));
-        }
+        self.check_count(scene)?;
         if !self.fits(scene) {
             let start = Instant::now();
             let rig: Rig = self.builder.build(&scene.lidar2img)?;
@@ -101,12 +159,23 @@ impl Moving {
     }
 }
 
-/// Opens model and scene, and checks that they belong together.
-pub fn open(model: &Path, scene: &Path) -> Result<(Arc<Model>, Scene)> {
+/// Opens model and scene, checks that they belong together, and notes what is not obeyed or does not look right.
+pub fn open(model: &Path, scene: &Path) -> Result<(Arc<Model>, Scene, Vec<Note>)> {
     let model = Arc::new(Model::open(model)?);
-    let loaded = Scene::open(scene)?;
-    loaded.check(model.network()).map_err(|e| e.in_file(scene))?;
-    Ok((model, loaded))
+    let (loaded, notes) = read(scene, model.network())?;
+    Ok((model, loaded, notes))
+}
+
+/// The scene for a network, and what is to be said of it.
+pub fn read(path: &Path, network: &Network) -> Result<(Scene, Vec<Note>)> {
+    let (scene, mut notes) = Scene::open_with_notes(path)?;
+    scene.check(network).map_err(|e| e.in_file(path))?;
+    let (cameras, expected) = (scene.cameras(), network.cameras);
+    if cameras != expected {
+        let message = format!("{cameras} cameras, the network was trained for {expected}");
+        notes.push(Note::new(message).in_file(path));
+    }
+    Ok((scene, notes))
 }
 
 /// Session options that the machine arguments ask for.

@@ -8,7 +8,7 @@ use voxcast::graph::Rewrites;
 use voxcast::model::{Model, Options};
 use voxcast::network::BUILT_IN;
 use voxcast::weights::Precision;
-use voxcast::{Error, ErrorKind, Isa, Network, Result};
+use voxcast::{Error, ErrorKind, Isa, Network, Note, Result};
 
 /// Turn a training checkpoint into a model: batch norms and the projection folded in f64, weights packed as the kernels
 /// read them.
@@ -18,8 +18,10 @@ Examples:
   voxcast import epoch_24.pth --network nuscenes-200 -o model.safetensors
   voxcast import weights.safetensors --network network.json --precision f16 -o model.safetensors
 
-A .pth file is read without executing anything: it may hold tensors and plain containers, and whatever else its pickle
-wants to call is refused by name.")]
+A .pth file, of either format that torch.save writes, is read without executing anything: it may hold tensors and plain
+containers, and whatever else its pickle wants to call is refused by name. What wrappers put in front of names (module.,
+_orig_mod., model.) is taken off, name by name. Notes on standard error say which state was taken of several, and which
+tensors the network does not have.")]
 pub struct Import {
     /// mmengine .pth, or .safetensors with the same names
     checkpoint: PathBuf,
@@ -69,6 +71,8 @@ impl Import {
             voxcast::selftest::record(&self.output, Isa::best(), &self.threads.threads()?).map_err(hint)?;
         }
         bar.finish_and_clear();
+        terminal::say(&checkpoint.notes());
+        terminal::say(&Vec::from_iter(unused(&checkpoint).map(|note| note.in_file(&self.checkpoint))));
         let model = Model::open(&self.output)?;
         println!(
             "{}: {} weights, {}, checksum {:016x}",
@@ -79,6 +83,19 @@ impl Import {
         );
         Ok(())
     }
+}
+
+/// Ends of names that training keeps for itself: counters of batch norms and of moving averages.
+const COUNTERS: [&str; 3] = ["num_batches_tracked", "steps", "n_averaged"];
+
+/// What the checkpoint has and the network does not: it would change the result if it belonged to it.
+fn unused(checkpoint: &Checkpoint) -> Option<Note> {
+    let is_counter = |name: &str| COUNTERS.contains(&name.rsplit('.').next().unwrap_or(name));
+    let unused: Vec<&str> = checkpoint.unused().filter(|name| !is_counter(name)).collect();
+    let shown: Vec<String> = unused.iter().take(3).map(|name| format!("{name:?}")).collect();
+    let more = if unused.len() > 3 { ", ..." } else { "" };
+    let message = format!("{} tensors that the network does not have: {}{more}", unused.len(), shown.join(", "));
+    (!unused.is_empty()).then(|| Note::new(message))
 }
 
 /// A built-in network by name, or one from a JSON file.

@@ -42,6 +42,9 @@ pub struct Profile {
     /// The scene's matrices: made by `voxcast rig`, or plain CSR of another program
     #[arg(long)]
     rig: Option<PathBuf>,
+    /// Use that rig even if it was made from another calibration than the scene's
+    #[arg(long, requires = "rig")]
+    any_rig: bool,
     /// A scene directory or .safetensors
     scene: PathBuf,
     /// Frames to time, after one that is not
@@ -88,12 +91,15 @@ struct Sliced {
 
 impl Profile {
     pub fn run(self) -> Result<()> {
-        let (model, scene) = frame::open(&self.model, &self.scene)?;
+        let (model, scene, notes) = frame::open(&self.model, &self.scene)?;
+        terminal::say(&notes);
         let mut options = frame::options(&self.machine)?;
         options.unfolded = self.unfolded;
         options.slice_cost = u64::from(self.slice) * 1_000_000;
-        let rig = Arc::new(frame::rig(self.rig.as_deref(), &model, &scene, &options)?);
-        let mut session = frame::session(&model, rig, &options)?;
+        let file = frame::RigFile { path: self.rig.as_deref(), any: self.any_rig };
+        let (rig, notes) = frame::rig(file, &model, &scene, &options)?;
+        terminal::say(&notes);
+        let mut session = frame::session(&model, Arc::new(rig), &options)?;
         let graph = session.graph().clone();
         let images = views(&scene);
         let index_of: BTreeMap<&str, usize> =

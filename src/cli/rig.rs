@@ -14,7 +14,10 @@ Examples:
   voxcast rig scene/calibration.json --model model.safetensors -o rig.safetensors
   voxcast rig scene/ --network network.json -o rig.safetensors
 
-Matrices depend on a network's sizes, not on its weights, so that a network which is still to be trained has its rig too.")]
+Matrices depend on a network's sizes, not on its weights, so that a network which is still to be trained has its rig too.
+A rig holds the digests of the calibration that it was made from: `run` refuses it for another one. Where cameras see less
+than 10 % of the voxels of level 1 together, or one of them less than 2 %, a note on standard error says so: axes, metres
+or intrinsics are hardly those of the images then.")]
 pub struct BuildRig {
     /// A scene, or only its calibration.json
     #[arg(value_name = "SCENE|CALIBRATION.json")]
@@ -28,6 +31,9 @@ pub struct BuildRig {
     /// The rig to write
     #[arg(short, long, value_name = "RIG")]
     output: PathBuf,
+    /// Print the summary as JSON
+    #[arg(long)]
+    json: bool,
     #[command(flatten)]
     machine: Machine,
 }
@@ -35,7 +41,7 @@ pub struct BuildRig {
 impl BuildRig {
     pub fn run(self) -> Result<()> {
         let network = self.network()?;
-        let lidar2img = frame::calibration(&self.scene)?;
+        let (names, lidar2img) = frame::calibration(&self.scene, &network)?;
         let threads = self.machine.threads()?;
         let mut builder = voxcast::rig::RigBuilder::new(&network, lidar2img.len(), self.machine.isa()?)
             .map_err(|e| e.in_file(self.source()))?
@@ -44,6 +50,27 @@ impl BuildRig {
         let rig = builder.build(&lidar2img).map_err(|e| e.in_file(&self.scene))?;
         let elapsed = start.elapsed();
         rig.save(&self.output, &network)?;
+        let visibility = rig.visibility(&network);
+        let notes = visibility.notes(&names);
+        terminal::say(&notes);
+        if self.json {
+            let matrix =
+                |m: voxcast::rig::Csr<'_>| serde_json::json!({"rows": m.ptr.len() - 1, "entries": m.col.len()});
+            let level = |index| {
+                let level = rig.level(index);
+                serde_json::json!({"volume": matrix(level.volume), "bev": matrix(level.bev)})
+            };
+            let cameras = names.iter().zip(&visibility.cameras);
+            let value = serde_json::json!({
+                "levels": [level(0), level(1), level(2)],
+                "seen": visibility.seen,
+                "cameras": cameras.map(|(name, seen)| serde_json::json!({"name": name, "seen": seen})).collect::<Vec<_>>(),
+                "notes": notes.iter().map(ToString::to_string).collect::<Vec<_>>(),
+                "seconds": elapsed.as_secs_f64(),
+            });
+            println!("{value}");
+            return Ok(());
+        }
         for index in 0..3 {
             let level = rig.level(index);
             for (name, matrix) in [("volume", level.volume), ("bev", level.bev)] {
@@ -55,6 +82,9 @@ impl BuildRig {
                 );
             }
         }
+        let shares = names.iter().zip(&visibility.cameras);
+        let shares: Vec<String> = shares.map(|(name, &share)| format!("{name} {}", terminal::percent(share))).collect();
+        println!("cameras see {} of the voxels: {}", terminal::percent(visibility.seen), shares.join(", "));
         println!("six matrices in {} on {} threads", terminal::time(elapsed), threads.count());
         Ok(())
     }

@@ -13,7 +13,7 @@ use voxcast::network::Grid;
 use voxcast::npz::{Array, Elements, write_npz};
 use voxcast::picture::{self, Figure, Palette};
 use voxcast::session::{Occupancy, views};
-use voxcast::{Error, Network, Result, Scene};
+use voxcast::{Error, Network, Note, Result, Scene};
 
 /// Run a model on a scene and write the class of every voxel.
 ///
@@ -32,7 +32,10 @@ Examples:
 In Python: numpy.load('out.npz')['classes'] is u8 [X, Y, Z], and ['support'] u16 [X, Y, Z] says by how many feature
 pixels each voxel is seen: where it is 0, no camera sees the place, and its class is a guess. Pictures hatch such places.
 ['bounds'] f32 [3, 2] are the grid's metres, ['colours'] u8 [K, 3] those of the classes in pictures.
-Without --rig the matrices are built from the scene's calibration before the frame.
+Without --rig the matrices are built from the scene's calibration before the frame. A rig that was made from another
+calibration is an error, unless --any-rig is given; one that does not say from which, as those of other programs, is used,
+and a note says so. Notes go to standard error and change nothing: what in the scene's files is not obeyed, and cameras
+that see too little of the grid (all together less than 10 % of the voxels, or one less than 2 %).
 The digest is the XXH3-64 of the classes; it is the same on any number of threads and any instruction set.")]
 pub struct Run {
     /// The model
@@ -41,6 +44,9 @@ pub struct Run {
     /// The scene's matrices: made by `voxcast rig`, or plain CSR of another program
     #[arg(long)]
     pub(super) rig: Option<PathBuf>,
+    /// Use that rig even if it was made from another calibration than the scene's
+    #[arg(long, requires = "rig")]
+    pub(super) any_rig: bool,
     /// A scene directory or .safetensors, or a directory of those
     pub(super) scene: PathBuf,
     /// The .npz to write, or of a sequence the directory for one per scene: `classes` u8 and `support` u16, both [X, Y, Z], `bounds` and `colours`
@@ -95,7 +101,7 @@ impl Run {
         for path in [Some(&self.output), self.png.as_ref(), self.html.as_ref()].into_iter().flatten() {
             frame::check_output(path)?;
         }
-        let (model, scene) = frame::open(&self.model, &self.scene)?;
+        let (model, scene, mut notes) = frame::open(&self.model, &self.scene)?;
         let mut dump = self.dump.as_ref().map(|_| Dump::new(self.stages.as_deref(), model.network())).transpose()?;
         let mut options = frame::options(&self.machine)?;
         options.logits = self.logits;
@@ -105,8 +111,11 @@ impl Run {
         let loaded = start.elapsed();
 
         let start = Instant::now();
-        let rig = Arc::new(frame::rig(self.rig.as_deref(), &model, &scene, &options)?);
+        let (rig, of_rig) = frame::rig(self.rig_file(), &model, &scene, &options)?;
         let rig_time = start.elapsed();
+        let rig = Arc::new(rig);
+        notes.extend(of_rig);
+        terminal::say(&notes);
         let mut session = frame::session(&model, rig.clone(), &options)?;
 
         let masked = masked(&self.mask, &scene).map_err(|e| e.in_file(&self.scene))?;
@@ -143,10 +152,20 @@ impl Run {
         if let (Some(dump), Some(directory)) = (dump, &self.dump) {
             dump.finish(directory, &rig, result.grid, result.classes)?;
         }
-        let summary = Summary { loaded, rig_time, mapped: self.rig.is_some(), frame_time };
+        let summary = Summary { loaded, rig_time, mapped: self.rig.is_some(), frame_time, notes };
         summary.print(network, &result, self.json);
         Ok(())
     }
+
+    pub(super) fn rig_file(&self) -> frame::RigFile<'_> {
+        frame::RigFile { path: self.rig.as_deref(), any: self.any_rig }
+    }
+}
+
+/// The share of the voxels that a camera sees, masked ones left out.
+pub fn seen(result: &Occupancy<'_>) -> f64 {
+    let seen = result.support.iter().filter(|&&pixels| pixels != 0).count();
+    seen as f64 / result.support.len().max(1) as f64
 }
 
 /// The cameras that `names` are, each once.
@@ -218,6 +237,7 @@ struct Summary {
     rig_time: Duration,
     mapped: bool,
     frame_time: Duration,
+    notes: Vec<Note>,
 }
 
 impl Summary {
@@ -232,6 +252,8 @@ impl Summary {
                 "counts": counts,
                 "digest": digest,
                 "logits_digest": logits,
+                "seen": seen(result),
+                "notes": self.notes.iter().map(ToString::to_string).collect::<Vec<_>>(),
                 "seconds": {
                     "load": self.loaded.as_secs_f64(),
                     "rig": self.rig_time.as_secs_f64(),
@@ -244,9 +266,10 @@ impl Summary {
         let [x, y, z] = result.grid;
         let occupied = result.classes.len() - counts[0];
         println!(
-            "{x}x{y}x{z} voxels, {occupied} occupied ({:.1} %), digest {digest}",
-            100.0 * occupied as f64 / result.classes.len() as f64
+            "{x}x{y}x{z} voxels, {occupied} occupied ({}), digest {digest}",
+            terminal::percent(occupied as f64 / result.classes.len() as f64)
         );
+        println!("cameras see {} of the voxels", terminal::percent(seen(result)));
         if let Some(logits) = logits {
             println!("logits digest {logits}");
         }

@@ -1,6 +1,6 @@
 //! How `eval` computes: frames of a data set, several at a time, each with all its predictors.
 
-use super::frame::Moving;
+use super::frame::{Moving, RigFile};
 use super::terminal;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -141,7 +141,9 @@ impl Worker<'_> {
                     scene.check(model.network()).map_err(said)?;
                     let running = match running {
                         Some(running) => running,
-                        none => none.insert(Moving::new(model, None, scene, &self.options).map_err(said)?),
+                        none => {
+                            none.insert(Moving::new(model, RigFile::default(), scene, &self.options).map_err(said)?)
+                        }
                     };
                     running.calibrate(scene).map_err(said)?;
                     let Occupancy { classes, support, logits, .. } = running.session.run_scene(scene).map_err(said)?;

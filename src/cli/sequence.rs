@@ -1,14 +1,14 @@
 //! `voxcast run` over the scenes of a drive, with one session.
 
 use super::frame::{self, Moving};
-use super::run::{Run, digest, draw, masked, title, write};
+use super::run::{Run, digest, draw, masked, seen, title, write};
 use super::terminal;
 use std::collections::{BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use voxcast::picture::Animation;
-use voxcast::{Error, Model, Result, Scene, SessionOptions};
+use voxcast::{Error, Model, Note, Result, Scene, SessionOptions};
 
 /// The scenes in `path`, in the order of their names, if it is a directory of scenes rather than a scene: directories
 /// with a calibration.json, and .safetensors files.
@@ -49,6 +49,8 @@ fn names(scenes: &[PathBuf]) -> Result<Vec<String>> {
 struct Done {
     name: String,
     digest: String,
+    /// The share of the voxels that a camera sees.
+    seen: f64,
     read: Duration,
     frame: Duration,
 }
@@ -76,15 +78,20 @@ impl Run {
         let mut driver: Option<Driver> = None;
         let mut animation: Option<Animation> = None;
         let mut done: Vec<Done> = Vec::with_capacity(scenes.len());
+        let mut said = Said::default();
         let bar = terminal::progress("running", scenes.len());
         for (path, name) in scenes.iter().zip(names) {
             let start = Instant::now();
-            let scene = Scene::open(path)?;
-            scene.check(model.network()).map_err(|e| e.in_file(path))?;
+            let (scene, notes) = frame::read(path, model.network())?;
             let read = start.elapsed();
+            bar.suspend(|| said.say(notes));
             let driver = match &mut driver {
                 Some(driver) => driver,
-                none => none.insert(Driver::new(self, &model, &scene, &options)?),
+                none => {
+                    let driver = none.insert(Driver::new(self, &model, &scene, &options)?);
+                    bar.suspend(|| said.say(std::mem::take(&mut driver.moving.notes)));
+                    driver
+                }
             };
             driver.prepare(self, &scene).map_err(|e| e.in_file(path))?;
             let start = Instant::now();
@@ -104,7 +111,7 @@ impl Run {
                 };
                 animation.push(&page.fitted(animation.size()))?;
             }
-            done.push(Done { name, digest: digest(&result), read, frame });
+            done.push(Done { name, digest: digest(&result), seen: seen(&result), read, frame });
             bar.inc(1);
         }
         bar.finish_and_clear();
@@ -112,11 +119,11 @@ impl Run {
             animation.finish()?;
         }
         let rigs = driver.map_or((0, Duration::ZERO), |driver| (driver.moving.rigs, driver.moving.rig_time));
-        self.print_sequence(&done, rigs);
+        self.print_sequence(&done, rigs, &said.notes);
         Ok(())
     }
 
-    fn print_sequence(&self, done: &[Done], (rigs, rig_time): (usize, Duration)) {
+    fn print_sequence(&self, done: &[Done], (rigs, rig_time): (usize, Duration), notes: &[Note]) {
         let latency = Latency::of(done.iter().map(|done| done.frame));
         let read = Latency::of(done.iter().map(|done| done.read));
         let all: String = done.iter().map(|done| done.digest.as_str()).collect();
@@ -128,6 +135,7 @@ impl Run {
                     serde_json::json!({
                         "scene": done.name,
                         "digest": done.digest,
+                        "seen": done.seen,
                         "read_seconds": done.read.as_secs_f64(),
                         "frame_seconds": done.frame.as_secs_f64(),
                     })
@@ -137,15 +145,41 @@ impl Run {
                 "digest": all,
                 "scenes": scenes,
                 "rigs": rigs,
+                "notes": notes.iter().map(ToString::to_string).collect::<Vec<_>>(),
                 "seconds": { "frame": latency.json(), "read": read.json(), "rigs": rig_time.as_secs_f64() },
             });
             println!("{value}");
             return;
         }
         println!("{} scenes with one session, digest {all}", done.len());
+        let shares = || done.iter().map(|done| done.seen);
+        println!(
+            "cameras see {} to {} of the voxels",
+            terminal::percent(shares().fold(1.0, f64::min)),
+            terminal::percent(shares().fold(0.0, f64::max))
+        );
         println!("frame {latency}");
         println!("reading a scene {read}");
         println!("rigs: {rigs}, in {}", terminal::time(rig_time));
+    }
+}
+
+/// What has been said of the scenes so far.
+#[derive(Default)]
+struct Said {
+    notes: Vec<Note>,
+}
+
+impl Said {
+    /// Says what has not been said of a scene before: the same holds of most scenes of a drive.
+    fn say(&mut self, notes: Vec<Note>) {
+        let known = self.notes.len();
+        for note in notes {
+            if self.notes.iter().all(|other| other.message() != note.message()) {
+                self.notes.push(note);
+            }
+        }
+        terminal::say(&self.notes[known..]);
     }
 }
 
@@ -157,17 +191,21 @@ struct Driver {
 
 impl Driver {
     fn new(run: &Run, model: &Arc<Model>, scene: &Scene, options: &SessionOptions) -> Result<Self> {
-        Ok(Self { moving: Moving::new(model, run.rig.as_deref(), scene, options)?, masked: BTreeSet::new() })
+        Ok(Self { moving: Moving::new(model, run.rig_file(), scene, options)?, masked: BTreeSet::new() })
     }
 
     /// Makes the session ready for a scene: builds the matrices anew where its cameras have moved, and masks those that
     /// the user names.
     fn prepare(&mut self, run: &Run, scene: &Scene) -> Result<()> {
-        if run.rig.is_some() && !self.moving.fits(scene) {
-            let message = "another calibration than the first scene, and --rig is of one; leave --rig out";
+        if run.any_rig {
+            self.moving.check_count(scene)?;
+        } else if run.rig.is_some() && !self.moving.fits(scene) {
+            let message =
+                "another calibration than the first scene, and --rig is of one; leave --rig out, or add --any-rig";
             return Err(Error::mismatch(message));
+        } else {
+            self.moving.calibrate(scene)?;
         }
-        self.moving.calibrate(scene)?;
         let masked = masked(&run.mask, scene)?;
         for camera in self.masked.symmetric_difference(&masked) {
             self.moving.session.set_masked(*camera, masked.contains(camera))?;

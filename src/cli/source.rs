@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 use voxcast::Result;
 use voxcast::dataset::nuscenes::{Labels, Scenes};
-use voxcast::dataset::semantickitti::Split;
+use voxcast::dataset::semantickitti::{Scans, Split};
 use voxcast::dataset::{DataSet, NuScenes, SemanticKitti, Synthetic};
 
 /// How sets are named, for help texts.
@@ -14,14 +14,16 @@ Data sets:
   synthetic:DIR                       what synth --set wrote
   surroundocc:ROOT:LABELS[:SCENES]    nuScenes with the labels of SurroundOcc, LABELS/samples/*.pcd.bin.npy
   occ3d:ROOT:LABELS[:SCENES]          nuScenes with the labels of Occ3D, LABELS/<scene>/<sample>/labels.npz (\"gts\")
-  semantickitti:ROOT[:SPLIT[:stereo]] scene completion of SemanticKITTI, ROOT/sequences/NN
+  semantickitti:ROOT[:SPLIT[:stereo][:all]]
+                                      scene completion of SemanticKITTI, ROOT/sequences/NN
 
 ROOT of nuScenes has samples/ and one v1.0-* of tables; of several, name the one, such as ROOT/v1.0-mini.
 SCENES: val (the official 150), train (all others), or a file with a name such as scene-0103 a line; all by default.
-SPLIT: val (08, the default), train, test, or a sequence such as 05. stereo adds image_3 as a second camera.";
+SPLIT: val (08, the default), train, test, or a sequence such as 05. stereo adds image_3 as a second camera.
+Scored is every fifth scan, as in the benchmark; all scores every scan that has labels.";
 
 const EXPECTED: &str = "expected synthetic:DIR, surroundocc:ROOT:LABELS[:SCENES], occ3d:ROOT:LABELS[:SCENES] or \
-                        semantickitti:ROOT[:SPLIT[:stereo]]";
+                        semantickitti:ROOT[:SPLIT[:stereo][:all]]";
 
 /// A data set, not yet opened.
 #[derive(Clone, Debug)]
@@ -35,7 +37,7 @@ pub struct Source {
 enum Kind {
     Synthetic(PathBuf),
     NuScenes { root: PathBuf, labels: Labels, directory: PathBuf, scenes: Scenes },
-    SemanticKitti { root: PathBuf, split: Split, stereo: bool },
+    SemanticKitti { root: PathBuf, split: Split, stereo: bool, scans: Scans },
 }
 
 impl FromStr for Source {
@@ -52,9 +54,11 @@ impl FromStr for Source {
             ("occ3d", [root, directory, scenes @ ..]) if scenes.len() < 2 => {
                 nuscenes(root, Labels::Occ3d, directory, scenes)
             }
-            ("semantickitti", [root]) => kitti(root, Split::Val, false),
-            ("semantickitti", [root, split]) => kitti(root, split.parse()?, false),
-            ("semantickitti", [root, split, "stereo"]) => kitti(root, split.parse()?, true),
+            ("semantickitti", [root]) => kitti(root, Split::Val, false, Scans::Benchmark),
+            ("semantickitti", [root, split]) => kitti(root, split.parse()?, false, Scans::Benchmark),
+            ("semantickitti", [root, split, "stereo"]) => kitti(root, split.parse()?, true, Scans::Benchmark),
+            ("semantickitti", [root, split, "all"]) => kitti(root, split.parse()?, false, Scans::Labelled),
+            ("semantickitti", [root, split, "stereo", "all"]) => kitti(root, split.parse()?, true, Scans::Labelled),
             _ => return Err(EXPECTED.to_owned()),
         };
         Ok(Self { text: text.to_owned(), kind })
@@ -71,8 +75,8 @@ fn nuscenes(root: &str, labels: Labels, directory: &str, scenes: &[&str]) -> Kin
     Kind::NuScenes { root: root.into(), labels, directory: directory.into(), scenes }
 }
 
-fn kitti(root: &str, split: Split, stereo: bool) -> Kind {
-    Kind::SemanticKitti { root: root.into(), split, stereo }
+fn kitti(root: &str, split: Split, stereo: bool, scans: Scans) -> Kind {
+    Kind::SemanticKitti { root: root.into(), split, stereo, scans }
 }
 
 impl fmt::Display for Source {
@@ -89,7 +93,9 @@ impl Source {
             Kind::NuScenes { root, labels, directory, scenes } => {
                 Box::new(NuScenes::open(root, *labels, directory, scenes)?)
             }
-            Kind::SemanticKitti { root, split, stereo } => Box::new(SemanticKitti::open(root, *split, *stereo)?),
+            Kind::SemanticKitti { root, split, stereo, scans } => {
+                Box::new(SemanticKitti::open(root, *split, *stereo, *scans)?)
+            }
         })
     }
 }
@@ -116,19 +122,29 @@ mod tests {
             assert_eq!((labels, scenes), (Labels::Occ3d, expected));
         }
         for (text, expected) in [
-            ("semantickitti:k", (Split::Val, false)),
-            ("semantickitti:k:train", (Split::Train, false)),
-            ("semantickitti:k:05:stereo", (Split::Sequence(5), true)),
+            ("semantickitti:k", (Split::Val, false, Scans::Benchmark)),
+            ("semantickitti:k:train", (Split::Train, false, Scans::Benchmark)),
+            ("semantickitti:k:val:all", (Split::Val, false, Scans::Labelled)),
+            ("semantickitti:k:05:stereo", (Split::Sequence(5), true, Scans::Benchmark)),
+            ("semantickitti:k:05:stereo:all", (Split::Sequence(5), true, Scans::Labelled)),
         ] {
-            let Kind::SemanticKitti { split, stereo, .. } = kind(text) else { panic!("SemanticKITTI") };
-            assert_eq!((split, stereo), expected, "{text}");
+            let Kind::SemanticKitti { split, stereo, scans, .. } = kind(text) else { panic!("SemanticKITTI") };
+            assert_eq!((split, stereo, scans), expected, "{text}");
             assert_eq!(text.parse::<Source>().expect(text).to_string(), text);
         }
     }
 
     #[test]
     fn what_names_no_set_is_refused() {
-        for text in ["", "dir", "cifar:x", "surroundocc:n", "occ3d:n:g:val:x", "semantickitti:k:val:mono"] {
+        for text in [
+            "",
+            "dir",
+            "cifar:x",
+            "surroundocc:n",
+            "occ3d:n:g:val:x",
+            "semantickitti:k:val:mono",
+            "semantickitti:k:val:all:stereo",
+        ] {
             assert_eq!(text.parse::<Source>().expect_err(text), EXPECTED);
         }
         assert!("semantickitti:k:23".parse::<Source>().expect_err("23").contains("a sequence 00 to 21"));

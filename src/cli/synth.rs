@@ -1,7 +1,7 @@
 //! `voxcast synth`
 
 use super::import::read_network;
-use super::{ThreadCount, terminal};
+use super::{ThreadCount, frame, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -54,9 +54,7 @@ impl Synth {
     pub fn run(self) -> Result<()> {
         let mut synthesiser = Synthesiser::new(&read_network(&self.network)?)?;
         if let Some(path) = &self.calibration {
-            let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, "read", &e))?;
-            let cameras = voxcast::camera::read_calibration(&text).map_err(|e| e.in_file(path))?;
-            let cameras: Vec<_> = cameras.into_iter().map(|c| (c.name, c.lidar2img)).collect();
+            let cameras: Vec<_> = frame::cameras(path)?.into_iter().map(|c| (c.name, c.lidar2img)).collect();
             synthesiser = synthesiser.with_cameras(&cameras).map_err(|e| e.in_file(path))?;
         }
         let workers = self.threads.count();

@@ -2,6 +2,19 @@
 
 use indicatif::{ProgressBar, ProgressStyle};
 use std::time::Duration;
+use voxcast::Note;
+
+/// Says what was not obeyed or hardly ever meant, one line each, where errors go too.
+pub fn say(notes: &[Note]) {
+    for note in notes {
+        eprintln!("voxcast: note: {note}");
+    }
+}
+
+/// A share as people read it.
+pub fn percent(share: f64) -> String {
+    format!("{:.1} %", 100.0 * share)
+}
 
 /// A progress bar on a terminal; nothing in a pipe.
 pub fn progress(what: &'static str, total: usize) -> ProgressBar {

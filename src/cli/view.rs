@@ -47,7 +47,11 @@ impl View {
         frame::check_output(&output)?;
         let network = self.network.as_deref().map(read_network).transpose()?;
         let stored = Stored::read(&self.result, network.as_ref()).map_err(|e| e.in_file(&self.result))?;
-        let scene = self.scene.as_deref().map(Scene::open).transpose()?;
+        let scene = self.scene.as_deref().map(Scene::open_with_notes).transpose()?;
+        let scene = scene.map(|(scene, notes)| {
+            terminal::say(&notes);
+            scene
+        });
         let truth = self.truth.as_deref().map(|path| read_labels(path, stored.grid)).transpose()?;
         let occupancy = stored.occupancy().map_err(|e| e.in_file(&self.result))?;
         let page = Page {
@@ -150,10 +154,6 @@ fn palette(colours: &[[u8; 3]]) -> Palette {
 }
 
 fn unfit(array: &OwnedArray, expected: &str) -> Error {
-    let kind = match array.elements {
-        OwnedElements::U8(_) => "u8",
-        OwnedElements::U16(_) => "u16",
-        OwnedElements::F32(_) => "f32",
-    };
+    let kind = array.elements.kind();
     Error::format(format!("array {:?} is {kind} {:?}, expected {expected}", array.name, array.shape))
 }

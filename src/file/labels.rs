@@ -31,7 +31,10 @@ pub fn read_labels(path: &Path, grid: [usize; 3]) -> Result<Vec<u8>> {
     }
     match classes.elements {
         OwnedElements::U8(classes) => Ok(classes),
-        _ => Err(Error::format("array \"classes\" is not u8, expected u8 [X, Y, Z]").in_file(path)),
+        other => {
+            let message = format!("array \"classes\" is {}, expected u8 [X, Y, Z]", other.kind());
+            Err(Error::format(message).in_file(path))
+        }
     }
 }
 
@@ -138,7 +141,7 @@ mod tests {
         for (name, shape, elements, expected) in [
             ("labels", [2, 3, 2], bytes, "no array \"classes\""),
             ("classes", [3, 2, 2], bytes, "shape [3, 2, 2], expected [2, 3, 2]"),
-            ("classes", [2, 3, 2], wide, "not u8"),
+            ("classes", [2, 3, 2], wide, "is u16, expected u8"),
         ] {
             write_npz(&path, &[Array { name, shape: &shape, elements }]).unwrap();
             let error = read_labels(&path, GRID).expect_err(expected);

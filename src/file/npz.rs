@@ -44,6 +44,20 @@ pub enum OwnedElements {
     U16(Vec<u16>),
     /// Single precision floats, bit for bit as stored.
     F32(Vec<f32>),
+    /// Elements of another type or order, which are not read: what they are, for a message. The entry is whole.
+    Unread(String),
+}
+
+impl OwnedElements {
+    /// What they are, for a message that they should be something else.
+    pub fn kind(&self) -> &str {
+        match self {
+            OwnedElements::U8(_) => "u8",
+            OwnedElements::U16(_) => "u16",
+            OwnedElements::F32(_) => "f32",
+            OwnedElements::Unread(what) => what,
+        }
+    }
 }
 
 /// An array that was read.
@@ -51,9 +65,9 @@ pub enum OwnedElements {
 pub struct OwnedArray {
     /// Its name, without `.npy`.
     pub name: String,
-    /// Lengths of the axes, slowest first.
+    /// Lengths of the axes, slowest first; none where the elements are not read and their header says no lengths.
     pub shape: Vec<usize>,
-    /// As many elements as the shape says.
+    /// As many elements as the shape says, if they are read.
     pub elements: OwnedElements,
 }
 
@@ -170,12 +184,14 @@ fn npy_header(descr: &str, shape: &[usize]) -> Vec<u8> {
 
 /// Reads every array of the `.npz` at `path`: `uint8`, `bool` (as bytes), little-endian `uint16` and `float32`, in C order.
 ///
+/// Files of other programs hold other arrays beside those that matter here. One of another element type or in Fortran
+/// order is [`OwnedElements::Unread`]: it is an error only for who needs it. Entries that are no `.npy` are left out.
 /// Memory is taken as elements arrive, never for what a header merely claims.
 ///
 /// # Errors
-/// [`ErrorKind::Io`] when the file cannot be opened; [`ErrorKind::Format`] when it is no zip, an entry is no `.npy`, its
-/// shape and its length disagree, a checksum fails, or it claims more than its compressed size can hold;
-/// [`ErrorKind::Unsupported`] for other element types and Fortran order.
+/// [`ErrorKind::Io`] when the file cannot be opened; [`ErrorKind::Format`] when it is no zip, an `.npy` does not begin as one,
+/// the shape and the length of an array disagree, a checksum fails, or an entry claims more than its compressed size can
+/// hold.
 pub fn read_npz(path: &Path) -> Result<Vec<OwnedArray>> {
     let file = File::open(path).map_err(|e| Error::io(path, "open", &e))?;
     let length = file.metadata().map_err(|e| Error::io(path, "read", &e))?.len();
@@ -192,14 +208,12 @@ fn read_from(reader: impl Read + Seek, length: u64) -> Result<Vec<OwnedArray>> {
     for index in 0..zip.len() {
         let mut entry = zip.by_index(index).map_err(|e| Error::format(format!("entry {index}: {e}")))?;
         let full_name = entry.name().map_err(|e| Error::format(format!("entry {index}: {e}")))?.into_owned();
-        let Some(name) = full_name.strip_suffix(".npy").map(str::to_owned) else {
-            return Err(Error::format(format!("entry {full_name:?}, expected a name that ends in .npy")));
-        };
         let size = entry.size();
         if size > budget {
             return Err(Error::format(format!("entry {full_name:?} claims {size} bytes, expected at most {budget}")));
         }
         budget -= size;
+        let Some(name) = full_name.strip_suffix(".npy").map(str::to_owned) else { continue };
         let array = read_array(&mut entry, size).map_err(|e| {
             // The kind stays; the entry's name goes in front, as the path does later.
             Error::new(e.kind(), format!("entry {full_name:?}: {}", e.message()))
@@ -211,14 +225,27 @@ fn read_from(reader: impl Read + Seek, length: u64) -> Result<Vec<OwnedArray>> {
 
 fn read_array(entry: &mut impl Read, size: u64) -> Result<(Vec<usize>, OwnedElements)> {
     let (literal, header) = read_header(entry)?;
-    let (descr, shape) = parse_header(&literal)?;
+    // Records have a list for a type. They are well formed, and nobody needs them here.
+    let (descr, fortran, shape) = match parse_header(&literal) {
+        Err(_) if literal.contains("'descr': [") => ("records", false, Vec::new()),
+        parsed => parsed?,
+    };
     let item = match descr {
-        "|u1" | "u1" | "<u1" | "|b1" => 1,
-        "<u2" => 2,
-        "<f4" => 4,
-        other => {
-            let message = format!("elements of type {other:?}, expected \"|u1\", \"<u2\" or \"<f4\"");
-            return Err(Error::new(ErrorKind::Unsupported, message));
+        _ if fortran && shape.len() > 1 => Err("in Fortran order".to_owned()),
+        "|u1" | "u1" | "<u1" | "|b1" => Ok(1),
+        "<u2" => Ok(2),
+        "<f4" => Ok(4),
+        other => Err(format!("of type {other:?}")),
+    };
+    let item = match item {
+        Ok(item) => item,
+        Err(what) => {
+            // The end is looked for, so that the checksum is compared.
+            let rest = io::copy(&mut entry.take(size + 1), &mut io::sink()).map_err(unreadable)?;
+            if size.checked_sub(header) != Some(rest) {
+                return Err(Error::format(format!("{rest} bytes of elements in {size} bytes, expected them whole")));
+            }
+            return Ok((shape, OwnedElements::Unread(what)));
         }
     };
     let bytes = read_elements(entry, &shape, item, header, size)?;
@@ -284,7 +311,11 @@ pub fn read_npy_integers(path: &Path) -> Result<(Vec<usize>, Vec<i64>)> {
 
 fn read_integers(file: &mut impl Read, size: u64) -> Result<(Vec<usize>, Vec<i64>)> {
     let (literal, header) = read_header(file)?;
-    let (descr, shape) = parse_header(&literal)?;
+    let (descr, fortran, shape) = parse_header(&literal)?;
+    // The order of one axis, and of none, is both.
+    if fortran && shape.len() > 1 {
+        return Err(Error::new(ErrorKind::Unsupported, "Fortran order, expected C order"));
+    }
     let unsupported = || {
         let message = format!("elements of type {descr:?}, expected little-endian integers such as \"<i8\"");
         Error::new(ErrorKind::Unsupported, message)
@@ -313,14 +344,16 @@ fn read_integers(file: &mut impl Read, size: u64) -> Result<(Vec<usize>, Vec<i64
     Ok((shape, integers))
 }
 
-/// The element type and shape of a header such as `{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }`.
-fn parse_header(literal: &str) -> Result<(&str, Vec<usize>)> {
+/// The element type, whether the order is Fortran's, and the shape of a header such as `{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }`.
+fn parse_header(literal: &str) -> Result<(&str, bool, Vec<usize>)> {
     let malformed = || Error::format(format!("header {:?}, expected descr, fortran_order and shape", literal.trim()));
     let after = |key: &str| literal.split_once(key).map(|(_, rest)| rest.trim_start()).ok_or_else(malformed);
     let descr = after("'descr':")?;
     let descr = descr.strip_prefix('\'').and_then(|d| d.split_once('\'')).ok_or_else(malformed)?.0;
-    if !after("'fortran_order':")?.starts_with("False") {
-        return Err(Error::new(ErrorKind::Unsupported, "Fortran order, expected C order"));
+    let order = after("'fortran_order':")?;
+    let fortran = order.starts_with("True");
+    if !fortran && !order.starts_with("False") {
+        return Err(malformed());
     }
     let shape = after("'shape':")?;
     let shape = shape.strip_prefix('(').and_then(|s| s.split_once(')')).ok_or_else(malformed)?.0;
@@ -332,7 +365,7 @@ fn parse_header(literal: &str) -> Result<(&str, Vec<usize>)> {
     if axes.len() > MAX_AXES {
         return Err(Error::format(format!("{} axes, expected at most {MAX_AXES}", axes.len())));
     }
-    Ok((descr, axes))
+    Ok((descr, fortran, axes))
 }
 
 #[cfg(test)]

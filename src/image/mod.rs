@@ -1,4 +1,7 @@
-//! A camera's image as the caller holds it.
+//! A camera's image: as the caller holds it, and as it lies in a file.
+
+#[cfg(feature = "images")]
+pub(crate) mod file;
 
 #[cfg(feature = "images")]
 pub(crate) mod png;

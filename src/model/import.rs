@@ -20,7 +20,16 @@ use std::path::Path;
 impl Source for Checkpoint {
     fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>> {
         let Some(tensor) = self.get(name) else {
-            return Err(Error::format(format!("tensor \"{name}\" is missing, expected shape {shape:?}")));
+            let near = self.nearest(name);
+            let (what, names) = match near.is_empty() {
+                true => ("its names begin with", self.names().take(3).collect()),
+                false => ("the nearest names are", near),
+            };
+            let names: Vec<String> = names.iter().map(|name| format!("{name:?}")).collect();
+            let names = names.join(", ");
+            return Err(Error::format(format!(
+                "tensor \"{name}\" is missing, expected shape {shape:?}; {what} {names}"
+            )));
         };
         if tensor.shape() != shape {
             return Err(Error::mismatch(format!(
@@ -28,8 +37,33 @@ impl Source for Checkpoint {
                 tensor.shape()
             )));
         }
+        if let Some(prefix) = name.strip_suffix("attention_biases") {
+            check_offsets(self, &format!("{prefix}attention_bias_idxs"), shape)?;
+        }
         tensor.to_f64()
     }
+}
+
+/// Checks that the table of offsets beside a window's biases, if the checkpoint has one, is the one that the kernel
+/// computes with: of points row by row, the offset (|dy|, |dx|) has the number |dy| side + |dx|.
+#[cfg(feature = "import")]
+fn check_offsets(checkpoint: &Checkpoint, name: &str, biases: &[usize]) -> Result<()> {
+    let Some(table) = checkpoint.get(name) else { return Ok(()) };
+    let points = biases.last().copied().unwrap_or_default();
+    let side = points.isqrt();
+    if table.shape() != [points, points] {
+        let message = format!("tensor \"{name}\" has shape {:?}, expected [{points}, {points}]", table.shape());
+        return Err(Error::mismatch(message));
+    }
+    for (at, found) in table.to_f64()?.into_iter().enumerate() {
+        let (a, b) = (at / points, at % points);
+        let expected = (a / side).abs_diff(b / side) * side + (a % side).abs_diff(b % side);
+        if found != expected as f64 {
+            let message = format!("tensor \"{name}\": element [{a}, {b}] is {found}, expected {expected}");
+            return Err(Error::mismatch(message));
+        }
+    }
+    Ok(())
 }
 
 /// Makes a model of the weights that `source` has and writes it to `path`, by way of a temporary file beside it. `progress` is told how

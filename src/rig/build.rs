@@ -14,6 +14,7 @@
 //! A slab's rows depend on nothing but the calibration, and slabs are joined by position: the number of threads cannot
 //! show in the result.
 
+use super::calibration::Calibration;
 use super::frustum::Frustum;
 use super::level::{LevelGrid, range};
 use super::rows::{Growing, PixelSet, out_of_memory, too_many_entries};
@@ -24,8 +25,8 @@ use crate::network::Network;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use voxcast_kernels::{Isa, LANES};
 use voxcast_kernels::project::project_points;
+use voxcast_kernels::{Isa, LANES};
 
 /// Rows of one matrix. A gibibyte of row pointers; `nuscenes-256` has 2^18.
 const MAX_ROWS: u128 = 1 << 28;
@@ -73,6 +74,8 @@ pub struct RigBuilder {
     scratch: Vec<Mutex<Scratch>>,
     threads: Threads,
     cameras: usize,
+    /// [`Calibration`] of the rig that is under way.
+    calibration: Calibration,
     isa: Isa,
     /// Entries of each matrix so far.
     entries: [[AtomicU64; 2]; 3],
@@ -141,6 +144,7 @@ impl RigBuilder {
             scratch: vec![Mutex::default()],
             threads: Threads::calling(),
             cameras,
+            calibration: Calibration::default(),
             isa,
             entries: Default::default(),
             tensors: Tensors::default(),
@@ -165,7 +169,11 @@ impl RigBuilder {
     /// [`ErrorKind::Mismatch`] if there are not as many matrices as cameras; [`ErrorKind::TooLarge`] if a matrix has
     /// more than 2^32 - 1 entries or memory runs out.
     pub fn build(&mut self, lidar2img: &[[f32; 16]]) -> Result<Rig> {
-        let mut rig = Rig { storage: Storage::Owned(Tensors::default()), cameras: self.cameras };
+        let mut rig = Rig {
+            storage: Storage::Owned(Tensors::default()),
+            cameras: self.cameras,
+            calibration: Calibration::default(),
+        };
         self.rebuild(lidar2img, &mut rig)?;
         Ok(rig)
     }
@@ -207,6 +215,7 @@ impl RigBuilder {
             views.clear();
             views.extend(lidar2img.iter().enumerate().map(|(c, m)| Frustum::new(level, self.cameras, c, m)));
         }
+        self.calibration.set(lidar2img);
         self.entries = Default::default();
         self.done = Some(0);
         Ok(())
@@ -249,6 +258,7 @@ impl RigBuilder {
             mapped => *mapped = Storage::Owned(std::mem::take(&mut self.tensors)),
         }
         rig.cameras = self.cameras;
+        std::mem::swap(&mut rig.calibration, &mut self.calibration);
         Ok(true)
     }
 

@@ -1,5 +1,6 @@
 //! Rigs as files: plain CSR tensors in safetensors, which other programs write too.
 
+use super::calibration::Calibration;
 use super::{Csr, Rig, Storage, Tensors};
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::file::container::{self, Container, Data, Layout, Tensor};
@@ -13,6 +14,9 @@ use std::path::Path;
 /// `"format"` of the files that [`Rig::save`] writes.
 const RIG_FORMAT: &str = "voxcast-rig-1";
 
+/// Metadata key of the [`Calibration`].
+const CALIBRATION: &str = "calibration";
+
 /// Tensors of a level, behind "level{1,2,3}.".
 const NAMES: [&str; 4] = ["volume.ptr", "volume.col", "bev.ptr", "bev.col"];
 
@@ -21,7 +25,8 @@ impl Rig {
     ///
     /// It must hold `level{1,2,3}.{volume,bev}.{ptr,col}` as one-dimensional u32; other tensors and foreign metadata are
     /// ignored. A rig that [`Rig::save`] wrote must also be whole, by its checksum, and made for the same cameras, image,
-    /// grids and sample points; a plain one cannot tell. The file must not be changed while the rig lives.
+    /// grids and sample points; a plain one cannot tell. Of which calibration it is, [`Rig::check_calibration`] compares.
+    /// The file must not be changed while the rig lives.
     ///
     /// # Errors
     /// [`ErrorKind::Io`] if the file cannot be read; [`ErrorKind::Format`] if it is no rig or breaks a rule of
@@ -45,7 +50,7 @@ impl Rig {
     /// # Errors
     /// As [`Rig::open`], without a file name.
     pub fn from_container(container: Container, network: &Network, cameras: usize) -> Result<Rig> {
-        check_metadata(container.metadata(), network, cameras)?;
+        let calibration = check_metadata(container.metadata(), network, cameras)?;
         let mut ranges = Tensors::<Range<usize>>::default();
         let mut in_place = cfg!(target_endian = "little");
         for l in 0..3 {
@@ -69,7 +74,7 @@ impl Rig {
             let bytes = container.bytes();
             Storage::Owned(ranges.map(|level| level.map(|r| as_words(&bytes[r]).into_owned())))
         };
-        Ok(Rig { storage, cameras })
+        Ok(Rig { storage, cameras, calibration })
     }
 
     /// Writes the rig, which belongs to `network`, to `path` with a checksum.
@@ -96,18 +101,22 @@ impl Rig {
                 tensors.push(Tensor { name, dtype: Dtype::U32, shape: vec![words.len()], data });
             }
         }
-        let metadata = BTreeMap::from([
+        let mut metadata = BTreeMap::from([
             (container::FORMAT.to_owned(), RIG_FORMAT.to_owned()),
             ("network".to_owned(), network.to_json()),
             ("cameras".to_owned(), self.cameras().to_string()),
         ]);
+        if self.calibration.is_known() {
+            metadata.insert(CALIBRATION.to_owned(), self.calibration.to_string());
+        }
         // Every tensor is of u32, so each starts on a multiple of 4 wherever the ones before it end.
         container::write(path, tensors, &metadata, Layout::Packed)
     }
 }
 
-/// Compares what a rig of our own says about itself. Plain rigs say nothing.
-fn check_metadata(metadata: &BTreeMap<String, String>, network: &Network, cameras: usize) -> Result<()> {
+/// Compares what a rig of our own says about itself, and gives the calibration that it was built from. Plain rigs say
+/// nothing.
+fn check_metadata(metadata: &BTreeMap<String, String>, network: &Network, cameras: usize) -> Result<Calibration> {
     match metadata.get(container::FORMAT).map(String::as_str) {
         Some(RIG_FORMAT) => {}
         Some(other) if other.starts_with("voxcast-rig-") => {
@@ -117,7 +126,7 @@ fn check_metadata(metadata: &BTreeMap<String, String>, network: &Network, camera
         Some(other) if other.starts_with(container::FORMAT_PREFIX) => {
             return Err(Error::mismatch(format!("a file of format {other:?}, expected a rig")));
         }
-        _ => return Ok(()),
+        _ => return Ok(Calibration::default()),
     }
     let get = |key: &str| metadata.get(key).ok_or_else(|| Error::format(format!("the metadata has no {key:?}")));
     let made_for = get("cameras")?;
@@ -139,7 +148,7 @@ fn check_metadata(metadata: &BTreeMap<String, String>, network: &Network, camera
             )));
         }
     }
-    Ok(())
+    metadata.get(CALIBRATION).map_or(Ok(Calibration::default()), |text| Calibration::parse(text, cameras))
 }
 
 /// The bytes of the one-dimensional u32 tensor `name`.

@@ -4,17 +4,22 @@
 
 mod axis;
 mod build;
+mod calibration;
 mod file;
 mod frustum;
 mod level;
 mod rows;
 #[cfg(test)]
 mod tests;
+mod visibility;
 
 pub use crate::graph::{Csr, Level};
 pub use build::RigBuilder;
+pub use visibility::Visibility;
 
+use crate::base::error::Result;
 use crate::file::container::Container;
+use calibration::Calibration;
 use std::ops::Range;
 
 /// Per level: volume ptr and col, then BEV ptr and col.
@@ -33,6 +38,7 @@ enum Storage {
 pub struct Rig {
     storage: Storage,
     cameras: usize,
+    calibration: Calibration,
 }
 
 impl Rig {
@@ -53,6 +59,19 @@ impl Rig {
     /// Number of cameras that the columns count through.
     pub fn cameras(&self) -> usize {
         self.cameras
+    }
+
+    /// Whether the rig is that of these cameras, in this order: true if it was built from the same `lidar2img`, false if
+    /// it does not say from which, as the plain rigs of other programs do not.
+    ///
+    /// Sessions do not ask: a rig of another calibration gathers other pixels than the scene's, without an error. Ask
+    /// where the calibration of the images is at hand.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Mismatch`](crate::ErrorKind::Mismatch) if it was built from others: it says whether cameras have
+    /// another order or which of them have another calibration.
+    pub fn check_calibration(&self, lidar2img: &[[f32; 16]]) -> Result<bool> {
+        self.calibration.check(lidar2img)
     }
 
     /// Whether the matrices lie in a mapped file rather than in memory of their own.

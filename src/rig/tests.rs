@@ -1,7 +1,7 @@
 //! The fast builder against a naive one, and the file format against damage.
 
 use super::*;
-use crate::base::error::{Error, ErrorKind};
+use crate::base::error::ErrorKind;
 use crate::base::threads::Threads;
 use crate::file::container::{self, Data, Layout, Tensor};
 use crate::network::{Network, Sampling};
@@ -474,7 +474,7 @@ fn every_truncation_of_a_plain_rig_is_refused() {
 fn broken_rules_of_plain_rigs_are_named() {
     let (_dir, _, network, rig) = saved();
     let good = plain(&rig);
-    let read = |tensors: &Plain| -> Result<Rig, Error> {
+    let read = |tensors: &Plain| -> Result<Rig> {
         Rig::from_container(Container::from_bytes(plain_bytes(tensors, 0))?, &network, 2)
     };
     read(&good).unwrap();

@@ -10,9 +10,15 @@
 //! ]}
 //! ```
 //!
-//! Keys that are not named here are ignored. A `lidar2img` is taken as it is, and goes before the other two.
+//! A `lidar2img` goes before the other two. Matrices must be what they are called, as far as the numbers tell: a
+//! `lidar2camera` is a rotation and a translation, an `intrinsic` upper triangular, and points are columns. Keys that are
+//! not named here are noted; those that say that the camera is no pinhole are refused.
 
-use crate::base::error::{Error, Result};
+use super::matrix::{self, Wrong};
+use crate::base::error::{Error, ErrorKind, Result};
+use crate::base::json;
+use crate::base::note::Note;
+use crate::network::Network;
 use glam::{DMat4, DVec4};
 use serde_json::{Map, Value};
 use std::path::{Component, Path};
@@ -35,20 +41,94 @@ pub struct Camera {
     pub lidar2img: [f32; 16],
 }
 
-/// The cameras of a `calibration.json`, in its order.
+impl Camera {
+    /// Checks that the camera's image, padded to multiples of 32, has the size that `network` takes.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Mismatch`] naming the camera, its size and the expected one.
+    pub fn check(&self, network: &Network) -> Result<()> {
+        super::check_padded(&self.name, [self.height, self.width], network)
+    }
+}
+
+/// Keys that describe a calibration or a camera to people, and of which no note is made.
+const DESCRIPTIONS: [&str; 9] =
+    ["source", "token", "timestamp", "comment", "description", "license", "channel", "id", "version"];
+
+/// The cameras of a `calibration.json`, in its order. [`read_calibration_with_notes`] also says what in it was not used.
+///
+/// # Errors
+/// As [`read_calibration_with_notes`].
+pub fn read_calibration(text: &str) -> Result<Vec<Camera>> {
+    read_calibration_with_notes(text).map(|(cameras, _)| cameras)
+}
+
+/// The cameras of a `calibration.json`, in its order, and what in it was not used or is hardly ever meant.
 ///
 /// Where a camera has `intrinsic` and `lidar2camera`, their product is computed in f64 and rounded once.
 ///
 /// # Errors
-/// [`ErrorKind::Format`](crate::ErrorKind::Format), naming the camera and the key, if the text is not JSON, has no
-/// cameras, or a camera lacks a key, has one of another type or shape, a number that is not finite in f32, or a file
-/// outside the calibration's directory.
-pub fn read_calibration(text: &str) -> Result<Vec<Camera>> {
-    let root: Value = serde_json::from_str(text).map_err(|e| Error::format(format!("calibration JSON: {e}")))?;
-    let cameras = root.get("cameras").and_then(Value::as_array).filter(|c| !c.is_empty());
-    let cameras =
-        cameras.ok_or_else(|| Error::format("calibration: no \"cameras\", expected a list of at least one"))?;
-    cameras.iter().enumerate().map(|(i, camera)| read_camera(i, camera)).collect()
+/// [`ErrorKind::Format`], naming the camera and the key, if the text is not JSON, has a key twice or no cameras, or a
+/// camera lacks a key, has one of another type or shape, a number that is not finite in f32, a file outside the
+/// calibration's directory, the name of another camera, or a matrix that is not what it is called: `lidar2camera` rigid
+/// within 0.005, `intrinsic` upper triangular with a last row of (0, 0, 1), `lidar2img` with a last row of (0, 0, 0, 1);
+/// [`ErrorKind::Unsupported`] if a key says that the camera is no pinhole.
+pub fn read_calibration_with_notes(text: &str) -> Result<(Vec<Camera>, Vec<Note>)> {
+    let root = json::parse(text).map_err(|e| Error::format(format!("calibration JSON: {e}")))?;
+    let list = root.get("cameras").and_then(Value::as_array).filter(|c| !c.is_empty());
+    let list = list.ok_or_else(|| Error::format("calibration: no \"cameras\", expected a list of at least one"))?;
+    let mut notes = Vec::new();
+    let mut cameras: Vec<Camera> = Vec::with_capacity(list.len().min(super::MAX_CAMERAS));
+    let mut unused = Vec::new();
+    if let Some(keys) = root.as_object() {
+        let entry = Entry { keys, who: "calibration".into() };
+        unused.extend(entry.unused(&["cameras"])?);
+    }
+    for (index, camera) in list.iter().enumerate() {
+        let camera = read_camera(index, camera, &mut unused, &mut notes)?;
+        if let Some(twin) = cameras.iter().position(|other| other.name == camera.name) {
+            let name = camera.name.escape_debug();
+            return Err(Error::format(format!(
+                "camera {index}: \"name\" is {name}, as of camera {twin}, expected another"
+            )));
+        }
+        if let Some(twin) = cameras.iter().find(|other| other.file == camera.file) {
+            let (a, b) = (twin.name.escape_debug(), camera.name.escape_debug());
+            notes.push(Note::new(format!("cameras {a} and {b} have the same image, {:?}", camera.file)));
+        }
+        cameras.push(camera);
+    }
+    unused.sort_unstable();
+    unused.dedup();
+    if !unused.is_empty() {
+        notes.insert(0, Note::new(format!("keys that are not used: {}", unused.join(", "))));
+    }
+    Ok((cameras, notes))
+}
+
+/// Whether a key is about what a pinhole's matrices cannot say: how the lens bends rays, or another kind of camera.
+fn is_of_a_lens(key: &str) -> bool {
+    let plain: String = key.chars().filter(char::is_ascii_alphanumeric).map(|c| c.to_ascii_lowercase()).collect();
+    let exact = ["d", "dist", "xi", "model", "cameramodel", "cameratype", "projection", "projectionmodel", "lens"];
+    let coefficient = matches!(plain.as_bytes(), [b'k' | b'p', b'0'..=b'9']);
+    coefficient
+        || exact.contains(&&*plain)
+        || ["distort", "distcoef", "fisheye"].iter().any(|part| plain.contains(part))
+}
+
+/// Whether a value of such a key says that there is nothing of the kind.
+fn says_pinhole(value: &Value) -> bool {
+    match value {
+        Value::Null | Value::Bool(false) => true,
+        Value::Bool(true) => false,
+        Value::Number(number) => number.as_f64() == Some(0.0),
+        Value::String(text) => {
+            let plain: String = text.chars().filter(char::is_ascii_alphabetic).collect();
+            ["", "pinhole", "perspective", "none", "plumbbob"].contains(&&*plain.to_ascii_lowercase())
+        }
+        Value::Array(items) => items.iter().all(says_pinhole),
+        Value::Object(keys) => keys.values().all(says_pinhole),
+    }
 }
 
 /// One camera's keys, and what to call it when one of them is wrong.
@@ -100,19 +180,90 @@ impl Entry<'_> {
         Ok(matrix)
     }
 
-    /// The product, or what is given in its place.
-    fn lidar2img(&self) -> Result<[f32; 16]> {
-        let (key, matrix) = if self.keys.contains_key("lidar2img") {
-            ("lidar2img", self.matrix::<4>("lidar2img")?)
+    /// A matrix that `check` finds nothing wrong with.
+    fn checked<const N: usize>(
+        &self,
+        key: &str,
+        check: fn(&[[f64; N]; N]) -> std::result::Result<(), Wrong>,
+    ) -> Result<[[f64; N]; N]> {
+        let matrix = self.matrix(key)?;
+        match check(&matrix) {
+            Ok(()) => Ok(matrix),
+            Err((found, expected)) => self.bad(key, &found, expected),
+        }
+    }
+
+    /// Keys that are not `known` and not for people. One that says that the camera is no pinhole is an error.
+    fn unused(&self, known: &[&str]) -> Result<Vec<String>> {
+        let mut unused = Vec::new();
+        for (key, value) in self.keys.iter().filter(|(key, _)| !known.contains(&key.as_str())) {
+            if is_of_a_lens(key) && !says_pinhole(value) {
+                let shown = key.escape_debug();
+                let message = format!(
+                    "{}: \"{shown}\" is {}, expected a pinhole camera; undistort the images first, or leave the key out",
+                    self.who,
+                    describe(Some(value))
+                );
+                return Err(Error::new(ErrorKind::Unsupported, message));
+            }
+            if !is_of_a_lens(key) && !DESCRIPTIONS.contains(&key.as_str()) {
+                unused.push(key.chars().take(40).collect::<String>().escape_debug().to_string());
+            }
+        }
+        Ok(unused)
+    }
+
+    /// The product of `intrinsic` and `lidar2camera`, in f64.
+    fn product(&self) -> Result<[[f64; 4]; 4]> {
+        let k = self.checked("intrinsic", matrix::check_intrinsic)?;
+        let row = |r: usize| DVec4::new(k[r][0], k[r][1], k[r][2], 0.0);
+        let intrinsic = DMat4::from_cols(row(0), row(1), row(2), DVec4::W).transpose();
+        let lidar2camera = self.checked("lidar2camera", matrix::check_rigid)?;
+        let lidar2camera = DMat4::from_cols_array_2d(&lidar2camera).transpose();
+        Ok((intrinsic * lidar2camera).transpose().to_cols_array_2d())
+    }
+
+    /// The product, or what is given in its place. `size` is the image's height and width.
+    fn lidar2img(&self, size: [usize; 2], notes: &mut Vec<Note>) -> Result<[f32; 16]> {
+        let has = |key| self.keys.contains_key(key);
+        let (key, matrix) = if has("lidar2img") {
+            let given = self.checked("lidar2img", matrix::check_projection)?;
+            if matrix::handedness(&given) < 0.0 {
+                notes.push(Note::new(format!(
+                    "{}: \"lidar2img\" mirrors the image; is one of its axes turned?",
+                    self.who
+                )));
+            }
+            match ["intrinsic", "lidar2camera"].map(has) {
+                [true, true] => {
+                    if !matrix::alike(&given, &self.product()?) {
+                        let message =
+                            "\"lidar2img\" is used, and is not the product of \"intrinsic\" and \"lidar2camera\"";
+                        notes.push(Note::new(format!("{}: {message}", self.who)));
+                    }
+                }
+                [false, false] => {}
+                [intrinsic, _] => {
+                    let key = if intrinsic { "intrinsic" } else { "lidar2camera" };
+                    notes.push(Note::new(format!("{}: \"{key}\" is not used, \"lidar2img\" is", self.who)));
+                }
+            }
+            ("lidar2img", given)
         } else {
-            if !self.keys.contains_key("intrinsic") {
+            if !has("intrinsic") {
                 return self.bad("lidar2img", "missing", "it, or \"intrinsic\" and \"lidar2camera\"");
             }
-            let k = self.matrix::<3>("intrinsic")?;
-            let row = |r: usize| DVec4::new(k[r][0], k[r][1], k[r][2], 0.0);
-            let intrinsic = DMat4::from_cols(row(0), row(1), row(2), DVec4::W).transpose();
-            let lidar2camera = DMat4::from_cols_array_2d(&self.matrix::<4>("lidar2camera")?).transpose();
-            ("intrinsic", (intrinsic * lidar2camera).transpose().to_cols_array_2d())
+            let product = self.product()?;
+            let [height, width] = size.map(|side| side as f64);
+            let [[_, _, u], [_, _, v], _] = self.matrix::<3>("intrinsic")?;
+            if !((0.0..=width).contains(&u) && (0.0..=height).contains(&v)) {
+                notes.push(Note::new(format!(
+                    "{}: \"intrinsic\" has its centre at ({u}, {v}), outside the image of {width} x {height} pixels; is it that \
+                     of the image in another size?",
+                    self.who
+                )));
+            }
+            ("intrinsic", product)
         };
         let rounded: [f32; 16] = std::array::from_fn(|i| matrix[i / 4][i % 4] as f32);
         match rounded.iter().position(|v| !v.is_finite()) {
@@ -126,7 +277,10 @@ impl Entry<'_> {
     }
 }
 
-fn read_camera(index: usize, value: &Value) -> Result<Camera> {
+/// Keys of a camera that are used.
+const KEYS: [&str; 7] = ["name", "file", "width", "height", "intrinsic", "lidar2camera", "lidar2img"];
+
+fn read_camera(index: usize, value: &Value, unused: &mut Vec<String>, notes: &mut Vec<Note>) -> Result<Camera> {
     let Some(keys) = value.as_object() else {
         return Err(Error::format(format!("camera {index}: {}, expected an object", describe(Some(value)))));
     };
@@ -140,7 +294,9 @@ fn read_camera(index: usize, value: &Value) -> Result<Camera> {
         return entry.bad("file", &format!("{file:?}"), "a path inside the calibration's directory");
     }
     let (width, height) = (entry.side("width")?, entry.side("height")?);
-    Ok(Camera { name, file, width, height, lidar2img: entry.lidar2img()? })
+    let lidar2img = entry.lidar2img([height, width], notes)?;
+    unused.extend(entry.unused(&KEYS)?);
+    Ok(Camera { name, file, width, height, lidar2img })
 }
 
 /// A JSON value in a few words.
@@ -158,115 +314,4 @@ fn describe(value: Option<&Value>) -> String {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use serde_json::json;
-
-    fn direct() -> Value {
-        json!({"name": "a", "file": "img/a.png", "width": 20, "height": 10, "extra": [null],
-            "lidar2img": [[1, 2, 3, 4], [5, 6, 7, 8], [9, 10, 11, 12], [0, 0, 0, 1.5]]})
-    }
-
-    fn product() -> Value {
-        json!({"name": "b", "file": "b.png", "width": 20, "height": 10,
-            "intrinsic": [[100.0, 0.0, 10.0], [0.0, 200.0, 5.0], [0.0, 0.0, 1.0]],
-            "lidar2camera": [[0, -1, 0, 0.5], [0, 0, -1, 0.25], [1, 0, 0, -2], [0, 0, 0, 1]]})
-    }
-
-    fn read(cameras: &[Value]) -> Result<Vec<Camera>> {
-        read_calibration(&json!({"source": "x", "cameras": cameras}).to_string())
-    }
-
-    #[test]
-    fn both_forms_by_hand() {
-        let cameras = read(&[direct(), product()]).unwrap();
-        assert_eq!((cameras[0].name.as_str(), cameras[0].file.as_str()), ("a", "img/a.png"));
-        assert_eq!((cameras[0].width, cameras[0].height), (20, 10));
-        let expected = [1., 2., 3., 4., 5., 6., 7., 8., 9., 10., 11., 12., 0., 0., 0., 1.5];
-        assert_eq!(cameras[0].lidar2img, expected);
-        // Row 0: 100 * (0, -1, 0, 0.5) + 10 * (1, 0, 0, -2); row 1: 200 * (0, 0, -1, 0.25) + 5 * (1, 0, 0, -2).
-        let expected = [10., -100., 0., 30., 5., 0., -200., 40., 1., 0., 0., -2., 0., 0., 0., 1.];
-        assert_eq!(cameras[1].lidar2img, expected);
-    }
-
-    #[test]
-    fn the_product_is_rounded_once() {
-        let mut camera = product();
-        // In f32, 2^24 + 1 loses its last bit before the subtraction; in f64 the difference is exactly 1.
-        camera["intrinsic"][0] = json!([16_777_217.0, 0.0, -16_777_216.0]);
-        camera["lidar2camera"] = json!([[1, 0, 0, 0], [0, 1, 0, 0], [1, 0, 1, 0], [0, 0, 0, 1]]);
-        assert_eq!(read(&[camera]).unwrap()[0].lidar2img[0], 1.0);
-    }
-
-    #[test]
-    fn a_matrix_that_is_given_goes_first() {
-        let mut camera = product();
-        camera["lidar2img"] = direct()["lidar2img"].clone();
-        assert_eq!(read(&[camera]).unwrap()[0].lidar2img[3], 4.0);
-    }
-
-    #[test]
-    fn wrong_keys_are_named() {
-        let cases = [
-            (direct(), "/name", json!(3), "camera 1: \"name\" is 3"),
-            (direct(), "/name", json!(""), "camera 1: \"name\" is an empty string"),
-            (direct(), "/file", json!("../b"), "\"file\" is \"../b\", expected a path inside"),
-            (direct(), "/file", json!("a/../../b"), "inside the calibration's directory"),
-            (direct(), "/file", json!("/etc/passwd"), "inside the calibration's directory"),
-            (direct(), "/file", json!("..\\b"), "inside the calibration's directory"),
-            (direct(), "/width", json!(0), "\"width\" is 0, expected 1 to 65536"),
-            (direct(), "/height", json!(2.5), "\"height\" is 2.5"),
-            (direct(), "/height", json!(65537), "\"height\" is 65537"),
-            (direct(), "/height", json!(-3), "\"height\" is -3"),
-            (direct(), "/lidar2img", json!([[1]]), "\"lidar2img\" is 1 rows, expected 4 rows of 4 numbers"),
-            (direct(), "/lidar2img/2", json!([1, 2, 3]), "\"lidar2img\" is a list of 3 in row 2"),
-            (direct(), "/lidar2img/2", json!("x"), "a string in row 2"),
-            (direct(), "/lidar2img/1/3", json!("x"), "a string in row 1, column 3"),
-            (direct(), "/lidar2img/1/3", json!(1e39), "\"lidar2img\" is 1e39 in row 1, column 3, expected finite"),
-            (direct(), "/lidar2img", json!(null), "\"lidar2img\" is null"),
-            (product(), "/intrinsic", json!([[1, 0, 0], [0, 1, 0]]), "\"intrinsic\" is 2 rows, expected 3 rows of 3"),
-            (product(), "/intrinsic/0/0", json!(1e300), "\"intrinsic\" is"),
-            (product(), "/lidar2camera/3", json!([0, 0, 1]), "\"lidar2camera\" is a list of 3 in row 3"),
-            (product(), "/lidar2camera", json!({}), "\"lidar2camera\" is an object"),
-            (product(), "", json!(7), "camera 1: 7, expected an object"),
-        ];
-        for (mut camera, pointer, value, expected) in cases {
-            *camera.pointer_mut(pointer).unwrap() = value;
-            let e = read(&[direct(), camera]).unwrap_err();
-            assert!(e.message().contains(expected), "{e} (expected {expected})");
-            assert!(e.message().starts_with("camera 1"), "{e}");
-        }
-    }
-
-    #[test]
-    fn missing_keys_are_named() {
-        for (camera, keys) in [
-            (direct(), &["name", "file", "width", "height", "lidar2img"][..]),
-            (product(), &["intrinsic", "lidar2camera"]),
-        ] {
-            for key in keys {
-                let mut camera = camera.clone();
-                camera.as_object_mut().unwrap().remove(*key);
-                let e = read(&[camera]).unwrap_err();
-                assert!(e.message().contains("missing"), "{e}");
-                assert!(e.message().contains(key), "{e}");
-            }
-        }
-    }
-
-    #[test]
-    fn what_is_no_calibration_is_refused() {
-        let good = json!({"cameras": [direct()]}).to_string();
-        assert!(read_calibration(&good).is_ok());
-        for n in 0..good.len() {
-            assert!(read_calibration(&good[..n]).is_err(), "cut to {n} bytes");
-        }
-        for text in ["[]", "{}", "{\"cameras\":[]}", "{\"cameras\":{}}", "{\"cameras\":[null]}"] {
-            assert!(read_calibration(text).is_err(), "{text}");
-        }
-        let nan = good.replace("1.5", "NaN");
-        assert!(read_calibration(&nan).unwrap_err().message().starts_with("calibration JSON"));
-        let infinite = good.replace("1.5", "1e999");
-        assert!(read_calibration(&infinite).is_err());
-    }
-}
+mod tests;

@@ -1,12 +1,14 @@
 //! A scene: one set of camera images with their calibration.
 
 pub mod camera;
+pub(crate) mod matrix;
 
 pub use crate::network::{MAX_SIDE, forward_of};
 
 use crate::base::error::{Error, ErrorKind, Result};
+use crate::base::note::Note;
 use crate::network::Network;
-use crate::scene::camera::read_calibration;
+use crate::scene::camera::read_calibration_with_notes;
 use safetensors::{Dtype, SafeTensors};
 use std::fs::File;
 use std::io::Read;
@@ -18,17 +20,8 @@ pub const MAX_CAMERAS: usize = 64;
 /// Largest `calibration.json` in bytes; one with 64 cameras needs a hundredth of it.
 const MAX_CALIBRATION: u64 = 8 << 20;
 
-/// Pixels that a byte of a compressed image can stand for at most: deflate's 1032 bytes of eight one-bit pixels. An image
-/// that claims more lies, and is refused before memory is taken for it.
-#[cfg(feature = "images")]
-const MAX_PIXELS_PER_BYTE: u64 = 8 * 1032;
-
-/// Name of the threads on which images are decoded.
-///
-/// A panic there is reported as an error of the file, but the process's panic hook has been called by then. A program
-/// that wants to say one thing only gives its hook an exception for this name.
-#[cfg(feature = "images")]
-pub const DECODER_THREAD: &str = "voxcast image decoder";
+/// Tensors of a scene file: the two that make the scene, and the labels that `voxcast synth --set` puts beside them.
+const TENSORS: [&str; 6] = ["images", "lidar2img", "labels", "visible", "pixel.class", "pixel.depth"];
 
 /// One camera image: 8-bit, three channels, rows top to bottom, **BGR** as the published networks were trained.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -61,22 +54,35 @@ impl Scene {
     /// Reads a scene: a directory with `calibration.json` and the JPEG or PNG images that it names, or a `.safetensors`
     /// file with `images` (u8 [N, H, W, 3], BGR) and `lidar2img` (f32 [N, 4, 4]).
     ///
-    /// Cameras keep the order of the file. Colours are 8 bits a channel; transparency is dropped, grey becomes three
-    /// equal channels and an orientation tag is ignored. JPEG decoders differ in the last bit: scenes that must give the
-    /// same bits everywhere hold PNGs or tensors.
+    /// Cameras keep the order of the file. Colours are 8 bits a channel, grey becomes three equal channels. JPEGs are
+    /// decoded to the bytes that libjpeg-turbo gives, and with it OpenCV, Pillow and torchvision. What the files say and
+    /// is not obeyed, [`Scene::open_with_notes`] tells.
     ///
     /// # Errors
     /// [`ErrorKind::Io`] when a file is missing or unreadable, naming the camera; [`ErrorKind::Format`] when it is
-    /// malformed, holds no camera or more than [`MAX_CAMERAS`], a matrix that is not finite, or a file name that leaves the
-    /// directory; [`ErrorKind::Mismatch`] when an image has another size than the calibration says;
-    /// [`ErrorKind::TooLarge`] when a side exceeds [`MAX_SIDE`]; [`ErrorKind::Unsupported`] for a directory when the
-    /// feature `images` is off.
+    /// malformed, not whole, holds no camera or more than [`MAX_CAMERAS`], a matrix that is not finite or not what it is
+    /// called ([`read_calibration_with_notes`]), or a file name that leaves the directory; [`ErrorKind::Mismatch`] when an
+    /// image has another size than the calibration says; [`ErrorKind::TooLarge`] when a side exceeds [`MAX_SIDE`];
+    /// [`ErrorKind::Unsupported`] for images that are transparent, turned by a tag, animated, of more than 8 bits a channel
+    /// or of other colours than grey, RGB and YCbCr, for cameras that are no pinholes, and for a directory when the feature
+    /// `images` is off.
     pub fn open(path: &Path) -> Result<Self> {
+        Self::open_with_notes(path).map(|(scene, _)| scene)
+    }
+
+    /// [`Scene::open`], and notes on what the files say that is not obeyed or hardly ever meant: keys of a calibration
+    /// that are not used, tensors beside the two, a colour profile, an intrinsic whose centre is outside its image.
+    ///
+    /// # Errors
+    /// As [`Scene::open`].
+    pub fn open_with_notes(path: &Path) -> Result<(Self, Vec<Note>)> {
+        let mut notes = Vec::new();
         if path.is_dir() {
-            return Self::open_directory(path);
+            return Ok((Self::open_directory(path, &mut notes)?, notes));
         }
-        let bytes = read_bounded(path, u64::MAX)?;
-        Self::from_safetensors(&bytes).map_err(|e| e.in_file(path))
+        let bytes = read_bounded(path, u64::MAX).map_err(|e| e.in_file(path))?;
+        let scene = Self::read_safetensors(&bytes, &mut notes).map_err(|e| e.in_file(path))?;
+        Ok((scene, notes.into_iter().map(|note| note.in_file(path)).collect()))
     }
 
     /// Reads the scene of `images` and `lidar2img` from the bytes of a safetensors file, as [`Scene::open`] does.
@@ -84,6 +90,10 @@ impl Scene {
     /// # Errors
     /// Those of [`Scene::open`], without a file name.
     pub fn from_safetensors(bytes: &[u8]) -> Result<Self> {
+        Self::read_safetensors(bytes, &mut Vec::new())
+    }
+
+    fn read_safetensors(bytes: &[u8], notes: &mut Vec<Note>) -> Result<Self> {
         let file =
             SafeTensors::deserialize(bytes).map_err(|e| Error::format(format!("not a safetensors file: {e}")))?;
         let tensor = |name: &str, dtype: Dtype, expected: &str| {
@@ -103,7 +113,8 @@ impl Scene {
             return Err(shape("images", images.shape(), "[N, H, W, 3]"));
         };
         check_count(cameras)?;
-        check_side("images", height, width)?;
+        check_side(height, width)
+            .map_err(|e| Error::new(e.kind(), format!("tensor \"images\": images of {}", e.message())))?;
         let matrices = tensor("lidar2img", Dtype::F32, "f32 [N, 4, 4]")?;
         if matrices.shape() != [cameras, 4, 4] {
             return Err(shape("lidar2img", matrices.shape(), &format!("[{cameras}, 4, 4]")));
@@ -114,23 +125,29 @@ impl Scene {
             let name = format!("camera {camera}");
             let entry = |i: usize| f32::from_le_bytes(std::array::from_fn(|b| matrix[4 * i + b]));
             let matrix: [f32; 16] = std::array::from_fn(entry);
-            check_finite(&name, &matrix)?;
+            check_matrix(&name, &matrix, notes)?;
             scene.names.push(name);
             scene.images.push(Image { height, width, bgr: bgr.to_vec() });
             scene.lidar2img.push(matrix);
         }
+        let mut unused: Vec<String> =
+            file.names().into_iter().filter(|name| !TENSORS.contains(name)).map(|n| format!("{n:?}")).collect();
+        if !unused.is_empty() {
+            unused.sort_unstable();
+            notes.push(Note::new(format!("tensors that are not used: {}", unused.join(", "))));
+        }
         Ok(scene)
     }
 
-    fn open_directory(directory: &Path) -> Result<Self> {
+    fn open_directory(directory: &Path, notes: &mut Vec<Note>) -> Result<Self> {
         let path = directory.join("calibration.json");
         let text = String::from_utf8(read_bounded(&path, MAX_CALIBRATION)?)
             .map_err(|_| Error::format("calibration is not UTF-8 text").in_file(&path))?;
-        let cameras = read_calibration(&text).map_err(|e| e.in_file(&path))?;
+        let (cameras, found) = read_calibration_with_notes(&text).map_err(|e| e.in_file(&path))?;
+        notes.extend(found.into_iter().map(|note| note.in_file(&path)));
         check_count(cameras.len()).map_err(|e| e.in_file(&path))?;
         let mut scene = Scene { names: Vec::new(), images: Vec::new(), lidar2img: Vec::new() };
         for camera in cameras {
-            check_finite(&camera.name, &camera.lidar2img).map_err(|e| e.in_file(&path))?;
             let file = Path::new(&camera.file);
             if camera.file.is_empty() || file.components().any(|c| !matches!(c, Component::Normal(_))) {
                 let message =
@@ -138,7 +155,7 @@ impl Scene {
                 return Err(Error::format(message).in_file(&path));
             }
             let size = Some([camera.height, camera.width]);
-            scene.images.push(read_image(&directory.join(file), &camera.name, size)?);
+            scene.images.push(read_image(&directory.join(file), &camera.name, size, notes)?);
             scene.names.push(camera.name);
             scene.lidar2img.push(camera.lidar2img);
         }
@@ -164,7 +181,8 @@ impl Scene {
         let mut cameras = Vec::new();
         let mut taken = std::collections::BTreeSet::new();
         for (index, (name, image)) in self.names.iter().zip(&self.images).enumerate() {
-            check_side(name, image.height, image.width)?;
+            check_side(image.height, image.width)
+                .map_err(|e| Error::new(e.kind(), format!("camera {name}: image of {}", e.message())))?;
             if image.bgr.len() != image.height * image.width * 3 {
                 let (found, size) = (image.bgr.len(), [image.height, image.width]);
                 return Err(Error::format(format!("camera {name}: {found} bytes of pixels, expected {size:?} x 3")));
@@ -197,21 +215,25 @@ impl Scene {
     /// # Errors
     /// [`ErrorKind::Mismatch`] naming the camera, its size and the expected one.
     pub fn check(&self, network: &Network) -> Result<()> {
-        for (name, image) in self.names.iter().zip(&self.images) {
-            let padded = [image.height.next_multiple_of(32), image.width.next_multiple_of(32)];
-            if padded != network.image {
-                return Err(Error::mismatch(format!(
-                    "camera {name}: image of {}x{} pads to {}x{}, the network expects {}x{} (height x width)",
-                    image.height, image.width, padded[0], padded[1], network.image[0], network.image[1]
-                )));
-            }
-        }
-        Ok(())
+        let check = |(name, image): (&String, &Image)| check_padded(name, [image.height, image.width], network);
+        self.names.iter().zip(&self.images).try_for_each(check)
     }
 }
 
+/// Refuses an image, of height and width, that does not pad to the size that `network` takes.
+fn check_padded(camera: &str, [height, width]: [usize; 2], network: &Network) -> Result<()> {
+    let padded = [height.next_multiple_of(32), width.next_multiple_of(32)];
+    if padded == network.image {
+        return Ok(());
+    }
+    Err(Error::mismatch(format!(
+        "camera {camera}: image of {height}x{width} pads to {}x{}, the network expects {}x{} (height x width)",
+        padded[0], padded[1], network.image[0], network.image[1]
+    )))
+}
+
 /// The whole file, if it is not longer than `limit` bytes.
-fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>> {
+pub(crate) fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>> {
     let file = File::open(path).map_err(|e| Error::io(path, "open", &e))?;
     let length = file.metadata().map_err(|e| Error::io(path, "read", &e))?.len();
     if length > limit {
@@ -231,16 +253,26 @@ fn check_count(cameras: usize) -> Result<()> {
     Err(Error::format(format!("{cameras} cameras, expected 1 to {MAX_CAMERAS}")))
 }
 
-fn check_side(camera: &str, height: usize, width: usize) -> Result<()> {
+/// Refuses an image without pixels or with a side beyond [`MAX_SIDE`].
+pub(crate) fn check_side(height: usize, width: usize) -> Result<()> {
     if height == 0 || width == 0 {
-        let message =
-            format!("camera {camera}: image of {height}x{width} (height x width), expected at least one pixel");
-        return Err(Error::format(message));
+        return Err(Error::format(format!("{height}x{width} (height x width), expected at least one pixel")));
     }
     if height > MAX_SIDE || width > MAX_SIDE {
-        let message =
-            format!("camera {camera}: image of {height}x{width} (height x width), expected sides up to {MAX_SIDE}");
+        let message = format!("{height}x{width} (height x width), expected sides up to {MAX_SIDE}");
         return Err(Error::new(ErrorKind::TooLarge, message));
+    }
+    Ok(())
+}
+
+/// Refuses a `lidar2img` that is none, and notes one that mirrors.
+fn check_matrix(camera: &str, matrix: &[f32; 16], notes: &mut Vec<Note>) -> Result<()> {
+    check_finite(camera, matrix)?;
+    let rows: [[f64; 4]; 4] = std::array::from_fn(|r| std::array::from_fn(|c| f64::from(matrix[4 * r + c])));
+    matrix::check_projection(&rows)
+        .map_err(|(found, expected)| Error::format(format!("{camera}: lidar2img is {found}, expected {expected}")))?;
+    if matrix::handedness(&rows) < 0.0 {
+        notes.push(Note::new(format!("{camera}: lidar2img mirrors the image; is one of its axes turned?")));
     }
     Ok(())
 }
@@ -256,64 +288,13 @@ pub(crate) fn check_finite(camera: &str, matrix: &[f32; 16]) -> Result<()> {
     }
 }
 
+#[cfg(feature = "images")]
+use crate::image::file::read_image;
+
 #[cfg(not(feature = "images"))]
-fn read_image(path: &Path, _camera: &str, _size: Option<[usize; 2]>) -> Result<Image> {
+fn read_image(path: &Path, _name: &str, _size: Option<[usize; 2]>, _notes: &mut Vec<Note>) -> Result<Image> {
     let message = "this build reads no image files (feature \"images\"), expected a .safetensors scene";
     Err(Error::new(ErrorKind::Unsupported, message).in_file(path))
-}
-
-/// Reads the image file of camera `name` as BGR. `size` is the height and width that the calibration says, where it does.
-///
-/// Decoders of image formats are large, and some files make them panic rather than fail. A thread of its own keeps that
-/// from the caller, and its name, [`DECODER_THREAD`], tells a panic hook whose panic it is.
-#[cfg(feature = "images")]
-pub(crate) fn read_image(path: &Path, name: &str, size: Option<[usize; 2]>) -> Result<Image> {
-    std::thread::scope(|scope| {
-        let builder = std::thread::Builder::new().name(DECODER_THREAD.into());
-        let thread = builder.spawn_scoped(scope, || decode_image(path, name, size));
-        let thread = thread.map_err(|e| Error::io(path, "start a thread to decode", &e))?;
-        let panicked = |_| Error::format(format!("image of camera {name}: its decoder gave up")).in_file(path);
-        thread.join().map_err(panicked)?
-    })
-}
-
-/// Decodes an image, after its header has passed every check on size.
-#[cfg(feature = "images")]
-fn decode_image(path: &Path, name: &str, size: Option<[usize; 2]>) -> Result<Image> {
-    use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
-
-    let missing = |doing: &str, e: &std::io::Error| {
-        let e = std::io::Error::new(e.kind(), format!("{e} (image of camera {name})"));
-        Error::io(path, doing, &e)
-    };
-    let file = File::open(path).map_err(|e| missing("open", &e))?;
-    let length = file.metadata().map_err(|e| missing("read", &e))?.len();
-    let broken = |e: image::ImageError| Error::format(format!("image of camera {name}: {e}")).in_file(path);
-    let mut reader =
-        ImageReader::new(std::io::BufReader::new(file)).with_guessed_format().map_err(|e| missing("read", &e))?;
-    let mut limits = Limits::default();
-    limits.max_image_width = Some(MAX_SIDE as u32);
-    limits.max_image_height = Some(MAX_SIDE as u32);
-    // Eight bytes a pixel is the widest that PNG has.
-    limits.max_alloc = Some((8 * MAX_SIDE * MAX_SIDE) as u64);
-    reader.limits(limits);
-    let decoder = reader.into_decoder().map_err(broken)?;
-    let (width, height) = decoder.dimensions();
-    let (width, height) = (width as usize, height as usize);
-    check_side(name, height, width).map_err(|e| e.in_file(path))?;
-    if let Some([h, w]) = size.filter(|&size| size != [height, width]) {
-        let message =
-            format!("camera {name}: image of {height}x{width}, the calibration expects {h}x{w} (height x width)");
-        return Err(Error::mismatch(message).in_file(path));
-    }
-    if (height * width) as u64 > length.saturating_mul(MAX_PIXELS_PER_BYTE) {
-        let message =
-            format!("camera {name}: image of {height}x{width} in {length} bytes, expected more bytes for its size");
-        return Err(Error::format(message).in_file(path));
-    }
-    let mut bgr = DynamicImage::from_decoder(decoder).map_err(broken)?.into_rgb8().into_raw();
-    bgr.chunks_exact_mut(3).for_each(|p| p.swap(0, 2));
-    Ok(Image { height, width, bgr })
 }
 
 #[cfg(test)]

@@ -4,7 +4,9 @@ use safetensors::tensor::TensorView;
 fn tensors(images: (Dtype, &[usize]), matrices: (Dtype, &[usize]), first: f32) -> Vec<u8> {
     let size = |(dtype, shape): (Dtype, &[usize])| shape.iter().product::<usize>() * dtype.bitsize() / 8;
     let pixels: Vec<u8> = (0..size(images)).map(|i| i as u8).collect();
-    let mut entries: Vec<u8> = first.to_le_bytes().to_vec();
+    // Unit matrices, but for the first element.
+    let unit = |i: usize| if i == 0 { first } else { f32::from(u8::from(i % 16 % 5 == 0)) };
+    let mut entries: Vec<u8> = (0..size(matrices) / 4).flat_map(|i| unit(i).to_le_bytes()).collect();
     entries.resize(size(matrices), 0);
     let views = [
         ("images", TensorView::new(images.0, images.1.to_vec(), &pixels).unwrap()),
@@ -45,6 +47,7 @@ fn malformed_safetensors_say_what_is_wrong() {
         (tensors((Dtype::U8, &[1, 1, 16385, 3]), (Dtype::F32, &[1, 4, 4]), 0.0), "sides up to 16384"),
         (tensors((Dtype::U8, &[1, 1, 1, 3]), (Dtype::F32, &[1, 4, 4]), f32::NAN), "lidar2img[0][0] is NaN"),
         (tensors((Dtype::U8, &[1, 1, 1, 3]), (Dtype::F32, &[1, 4, 4]), f32::INFINITY), "is inf"),
+        (tensors((Dtype::U8, &[1, 1, 1, 3]), (Dtype::F32, &[1, 4, 4]), 0.0), "camera 0: lidar2img is singular"),
     ] {
         let error = Scene::from_safetensors(&bytes).unwrap_err();
         assert!(error.message().contains(expected), "{error} does not say {expected:?}");
@@ -52,6 +55,51 @@ fn malformed_safetensors_say_what_is_wrong() {
     let bytes = sample();
     for length in 0..bytes.len() {
         assert!(Scene::from_safetensors(&bytes[..length]).is_err(), "{length} bytes were accepted");
+    }
+}
+
+/// A scene file of one pixel with more tensors beside its two, and the last column of its matrix.
+fn with(more: &[&str], column: [f32; 4]) -> Vec<u8> {
+    let matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0; 3]];
+    let matrix: Vec<u8> = matrix
+        .iter()
+        .zip(column)
+        .flat_map(|(row, last)| row.iter().copied().chain([last]))
+        .flat_map(f32::to_le_bytes)
+        .collect();
+    let view = |dtype, shape: &[usize], data| TensorView::new(dtype, shape.to_vec(), data).unwrap();
+    let mut views = vec![
+        ("images", view(Dtype::U8, &[1, 1, 1, 3], &[1, 2, 3][..])),
+        ("lidar2img", view(Dtype::F32, &[1, 4, 4], &matrix)),
+    ];
+    views.extend(more.iter().map(|name| (*name, view(Dtype::U8, &[1], &[7][..]))));
+    safetensors::serialize(views, None).unwrap()
+}
+
+#[test]
+fn tensors_that_are_not_used_are_noted() {
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("scene.safetensors");
+    for (more, expected) in [
+        (&[][..], None),
+        (&["labels", "visible", "pixel.depth"], None),
+        (&["img_aug_matrix", "cam_intrinsic"], Some("not used: \"cam_intrinsic\", \"img_aug_matrix\"")),
+        (&["Images"], Some("not used: \"Images\"")),
+    ] {
+        std::fs::write(&path, with(more, [0.0, 0.0, 0.0, 1.0])).unwrap();
+        let (_, notes) = Scene::open_with_notes(&path).unwrap();
+        assert_eq!(notes.len(), usize::from(expected.is_some()), "{notes:?}");
+        let said = notes.first().map(ToString::to_string).unwrap_or_default();
+        assert!(said.contains(expected.unwrap_or_default()), "{said}");
+        assert!(notes.iter().all(|note| note.path() == Some(&path)));
+    }
+    for (column, expected) in [
+        ([1.0, 2.0, 3.0, 0.0], "in row 3, expected [0, 0, 0, 1]"),
+        ([0.0, 0.0, 0.0, 1.5], "in row 3"),
+        ([0.0, 0.0, 0.0, f32::NAN], "lidar2img[3][3] is NaN"),
+    ] {
+        let error = Scene::from_safetensors(&with(&[], column)).expect_err(expected);
+        assert!(error.message().contains(expected), "{error}");
     }
 }
 
@@ -76,7 +124,20 @@ mod directory {
     fn scene() -> Scene {
         let mut scene = Scene::from_safetensors(&sample()).unwrap();
         scene.names = vec!["CAM_FRONT".into(), "rück/seite".into()];
-        scene.lidar2img[1] = std::array::from_fn(|i| 0.1 * i as f32 - 1.0 / 3.0);
+        scene.lidar2img[1][..12].copy_from_slice(&[
+            0.1,
+            -1.0 / 3.0,
+            0.7,
+            5.0,
+            0.3,
+            2.0,
+            0.25,
+            -1.0,
+            0.5,
+            0.125,
+            1.0,
+            9.0,
+        ]);
         scene
     }
 
@@ -112,7 +173,7 @@ mod directory {
         scene.names = vec!["01_a".into(), "A".into()];
         scene.images.push(scene.images[0].clone());
         scene.names.push("a".into());
-        scene.lidar2img.push([0.5; 16]);
+        scene.lidar2img.push(scene.lidar2img[1]);
         let dir = tempfile::tempdir().unwrap();
         scene.save(dir.path()).unwrap();
         assert_eq!(Scene::open(dir.path()).unwrap(), scene);
@@ -123,7 +184,7 @@ mod directory {
         let error = edited("\"width\":5", "\"width\":6");
         assert_eq!(error.kind(), ErrorKind::Mismatch);
         assert!(error.path().unwrap().ends_with("CAM_FRONT.png"));
-        assert!(error.message().contains("image of 3x5, the calibration expects 3x6"), "{error}");
+        assert!(error.message().contains("CAM_FRONT: 3x5, the calibration expects 3x6"), "{error}");
         for name in ["../CAM_FRONT.png", "/etc/passwd", "."] {
             let error = edited("\"CAM_FRONT.png\"", &format!("{name:?}"));
             assert!(error.message().contains("expected a path inside the"), "{error}");
@@ -142,8 +203,7 @@ mod directory {
         let scene = dir.path().join("deep/scene");
         let path = scene.join("CAM_FRONT.png");
         let bytes = fs::read(&path).unwrap();
-        for length in 0..bytes.len() - 12 {
-            // The last twelve bytes are the end marker, which decoders do not need.
+        for length in 0..bytes.len() {
             fs::write(&path, &bytes[..length]).unwrap();
             let error = Scene::open(&scene).unwrap_err();
             assert!(error.path() == Some(&path) && error.message().contains("CAM_FRONT"), "{length}: {error}");
@@ -171,30 +231,6 @@ mod directory {
             let error = Scene::open(&scene).unwrap_err();
             assert!(error.message().contains(expected), "{error}");
         }
-    }
-
-    /// A JPEG that is cut into blocks in a way that its decoder did not expect: progressive, with a third component
-    /// four times as wide as the second.
-    #[test]
-    fn decoder_that_panics_is_an_error_of_the_image() {
-        let dir = saved();
-        let scene = dir.path().join("deep/scene");
-        let path = scene.join("CAM_FRONT.png");
-        let mut bytes = Vec::new();
-        let pixels: Vec<u8> = (0..9 * 7 * 3).map(|i| (i * 37 % 251) as u8).collect();
-        let encoder = image::codecs::jpeg::JpegEncoder::new(&mut bytes);
-        image::ImageEncoder::write_image(encoder, &pixels, 9, 7, image::ExtendedColorType::Rgb8).unwrap();
-        let frame = bytes.windows(2).position(|marker| marker == [0xff, 0xc0]).unwrap();
-        bytes[frame + 1] = 0xc2;
-        for (component, sampling) in [0x21, 0x11, 0x42].into_iter().enumerate() {
-            bytes[frame + 11 + 3 * component] = sampling;
-        }
-        fs::write(&path, bytes).unwrap();
-        let text = fs::read_to_string(scene.join("calibration.json")).unwrap();
-        let text = text.replacen("\"width\":5", "\"width\":9", 1).replacen("\"height\":3", "\"height\":7", 1);
-        fs::write(scene.join("calibration.json"), text).unwrap();
-        let error = Scene::open(&scene).unwrap_err();
-        assert!(error.path() == Some(&path) && error.message().contains("CAM_FRONT"), "{error}");
     }
 
     fn crc32(bytes: &[u8]) -> u32 {

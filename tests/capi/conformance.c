@@ -409,6 +409,15 @@ static void rigs(voxcast_session *session, voxcast_rig *first, uint64_t expected
     float turned[CAMERAS * 16];
     memcpy(turned, matrices + 16, sizeof turned / 2);
     memcpy(turned + 16, matrices, sizeof turned / 2);
+    uint32_t known = 7;
+    RETURNS(VOXCAST_OK, voxcast_rig_check(first, matrices, CAMERAS, &known, SAID));
+    CHECK(known == 1);
+    RETURNS(VOXCAST_MISMATCH, voxcast_rig_check(first, turned, CAMERAS, &known, SAID));
+    CHECK(known == 0 && strstr(message, "another order"));
+    RETURNS(VOXCAST_MISMATCH, voxcast_rig_check(first, matrices, CAMERAS - 1, &known, SAID));
+    RETURNS(VOXCAST_INVALID_ARGUMENT, voxcast_rig_check(first, NULL, CAMERAS, &known, SAID));
+    RETURNS(VOXCAST_INVALID_ARGUMENT, voxcast_rig_check(NULL, matrices, CAMERAS, &known, SAID));
+    RETURNS(VOXCAST_INVALID_ARGUMENT, voxcast_rig_check(first, matrices, CAMERAS, NULL, SAID));
     RETURNS(VOXCAST_OK, voxcast_rig_builder_build(builder, turned, CAMERAS, &spare, SAID));
     RETURNS(VOXCAST_MISMATCH, voxcast_rig_builder_advance(builder, 1, spare, &complete, SAID));
 

@@ -166,13 +166,135 @@ proptest! {
 }
 
 #[test]
-fn the_prefix_of_data_parallel_is_dropped_where_all_names_have_it() {
+fn what_wrappers_put_in_front_is_taken_off_name_by_name() {
     let one = || Tensor::f32(&[1], &[1.0]);
-    let names =
-        |tensors: &[(&str, Tensor)]| read(pth(2, Wrap::Bare, tensors)).names().map(str::to_owned).collect::<Vec<_>>();
-    assert_eq!(names(&[("module.b", one()), ("module.a.w", one())]), ["a.w", "b"]);
-    assert_eq!(names(&[("module.b", one()), ("a", one())]), ["a", "module.b"]);
-    assert_eq!(names(&[("module.", one())]), ["module."]);
+    let names = |names: &[&str]| {
+        let tensors: Vec<_> = names.iter().map(|name| (*name, one())).collect();
+        let checkpoint = read(pth(2, Wrap::Bare, &tensors));
+        assert_eq!(checkpoint.notes().is_empty(), checkpoint.names().eq(names.iter().copied()), "what is done is said");
+        checkpoint.names().map(str::to_owned).collect::<Vec<_>>()
+    };
+    assert_eq!(names(&["module.a.w", "module.b"]), ["a.w", "b"]);
+    assert_eq!(names(&["module.b", "steps"]), ["b", "steps"]);
+    assert_eq!(names(&["model.module._orig_mod.b"]), ["b"]);
+    assert_eq!(names(&["b", "module.b"]), ["b", "module.b"]);
+    assert_eq!(names(&["module."]), ["module."]);
+}
+
+/// A dict of state dicts, each of one tensor, the first with the value 0, the next with 1, and so on.
+fn states(keys: &[&str]) -> Vec<u8> {
+    let mut p = Pickle::new(2).raw(b"}(");
+    let tensors: Vec<_> = (0..keys.len()).map(|i| Tensor::f32(&[1], &[i as f32])).collect();
+    for (i, (key, tensor)) in keys.iter().zip(&tensors).enumerate() {
+        p = p.text(key).raw(b"}").text("w").tensor(&i.to_string(), tensor).raw(b"s");
+    }
+    pth::zip(&pth::entries(p.raw(b"u").stop(), &tensors))
+}
+
+#[test]
+fn of_several_states_one_is_taken_and_the_others_are_named() {
+    for (keys, value, said) in [
+        (&["state_dict"][..], 0.0, None),
+        (&["optimizer", "state_dict"], 1.0, None),
+        (&["ema_state_dict", "state_dict"], 1.0, Some("under \"state_dict\"; not used: ema_state_dict")),
+        (&["model"], 0.0, Some("under \"model\"")),
+        (&["module", "optimizer"], 0.0, Some("under \"module\"")),
+        (&["model_ema", "model_state_dict"], 1.0, Some("under \"model_state_dict\"; not used: model_ema")),
+        (&["net", "model", "epoch"], 1.0, Some("under \"model\"; not used: net")),
+    ] {
+        let checkpoint = read(states(keys));
+        assert_eq!(values(&checkpoint, "w"), [value], "{keys:?}");
+        let notes: Vec<String> = checkpoint.notes().iter().map(ToString::to_string).collect();
+        assert_eq!(notes.len(), usize::from(said.is_some()), "{notes:?}");
+        assert!(notes.iter().all(|note| note.contains(said.unwrap_or_default())), "{notes:?}");
+    }
+    let error = Checkpoint::from_bytes(states(&["weights", "optimizer"])).unwrap_err();
+    assert!(error.message().contains("its keys begin with \"weights\", \"optimizer\""), "{error}");
+}
+
+#[test]
+fn what_was_not_asked_for_is_known() {
+    let one = || Tensor::f32(&[1], &[1.0]);
+    let checkpoint = read(pth(2, Wrap::Bare, &[("module.a.w", one()), ("module.b.w", one()), ("steps", one())]));
+    assert_eq!(checkpoint.unused().collect::<Vec<_>>(), ["a.w", "b.w", "steps"]);
+    checkpoint.get("a.w").unwrap();
+    assert!(checkpoint.get("c.w").is_none());
+    assert_eq!(checkpoint.unused().collect::<Vec<_>>(), ["b.w", "steps"]);
+    assert_eq!(checkpoint.nearest("x.a.w"), ["a.w"]);
+}
+
+#[test]
+fn files_without_a_zip_hold_the_same() {
+    let all = dtypes();
+    let tensors: Vec<_> =
+        all.iter().map(|(class, _, bytes, _)| (*class, Tensor::new(class, &[3], 3, bytes.clone()))).collect();
+    for wrap in [Wrap::Runner, Wrap::Bare, Wrap::Dict] {
+        let checkpoint = read(pth::legacy(wrap, &tensors));
+        for (class, dtype, _, want) in &all {
+            assert_eq!(checkpoint.get(class).unwrap().dtype(), *dtype);
+            assert_eq!(values(&checkpoint, class), want, "{class}, {wrap:?}");
+        }
+    }
+    // torch writes None behind the length of a storage; a view of one, and a frame around the number of newer protocols.
+    let tensor = Tensor { offset: 1, shape: vec![2], stride: vec![2], ..Tensor::f32(&[4], &[1.0, 2.0, 3.0, 4.0]) };
+    let pickle = pth::pickle(2, Wrap::Dict, &[("w", tensor.clone())]);
+    let at = pickle.windows(2).position(|w| w == b"tQ").unwrap();
+    let with = |what: &[u8]| [&pickle[..at], what, &pickle[at..]].concat();
+    let file = |pickle: Vec<u8>| pth::legacy_of(pickle, &[("0", 4, tensor.bytes.clone())]);
+    let plain = file(with(b"N"));
+    assert_eq!(values(&read(plain.clone()), "w"), [2.0, 4.0]);
+    let framed = [&b"\x80\x04\x95\x0d\0\0\0\0\0\0\0"[..], &plain[2..]].concat();
+    assert_eq!(values(&read(framed), "w"), [2.0, 4.0]);
+    let message = |bytes: Vec<u8>| Checkpoint::from_bytes(bytes).unwrap_err().message().to_owned();
+    let part = with(&Pickle::new(2).text("1").0[2..]);
+    assert!(message(file(part)).contains("a storage that is a part of another"));
+    for length in 0..plain.len() {
+        assert!(Checkpoint::from_bytes(plain[..length].to_vec()).is_err(), "{length} of {} bytes", plain.len());
+    }
+    assert!(message([&plain[..], b"x"].concat()).contains("1 bytes behind the last storage"));
+    let edit = |from: &[u8], to: &[u8]| {
+        let at = plain.windows(from.len()).position(|w| w == from).unwrap();
+        [&plain[..at], to, &plain[at + from.len()..]].concat()
+    };
+    for (bytes, expected) in [
+        (edit(b"little_endian\x88", b"little_endian\x89"), "little_endian is False"),
+        (edit(b"little_endian\x88", b"little_endiam\x88"), "does not say its byte order"),
+        (edit(b"M\xe9\x03.", b"M\xe8\x03."), "version 1000 of torch.save's format, expected 1001"),
+        (edit(b"\x04\0\0\0\0\0\0\0", b"\x05\0\0\0\0\0\0\0"), "5 elements of 4 bytes, 16 bytes are left"),
+        (edit(b"\x04\0\0\0\0\0\0\0", b"\x03\0\0\0\0\0\0\0"), "4 bytes behind the last storage"),
+        (edit(b"\x04\0\0\0\0\0\0\0", &[0xff; 8]), "-1 elements of 4 bytes"),
+        (pth::legacy_of(with(b"N"), &[]), "no storage \"0\" behind the pickle"),
+        (pth::legacy_of(with(b"N"), &[("0", 4, vec![0; 12])]), "declared are 4 elements"),
+        (pth::legacy_of(with(b"N"), &[("0", 4, vec![0; 16]), ("0", 4, vec![0; 16])]), "it is there twice"),
+        (pth::legacy_of(with(b"N"), &[("0", 4, vec![0; 16]), ("7", 4, vec![])]), "no tensor has it"),
+    ] {
+        let text = message(bytes);
+        assert!(text.contains(expected), "{text} (expected {expected})");
+    }
+}
+
+#[test]
+fn tensors_that_mean_something_else_than_they_store_are_refused() {
+    let tensor = Tensor::f32(&[2], &[1.0, 2.0]);
+    let v2 = |metadata: &[u8]| {
+        let p = Pickle::new(2).raw(b"}").text("w").global("torch._utils", "_rebuild_tensor_v2").raw(b"(");
+        let p = p.storage("FloatStorage", "0", 2).int(0).ints(&[2]).ints(&[1]).raw(b"\x89").ordered_dict();
+        pth::zip(&pth::entries(p.raw(metadata).raw(b"tRs").stop(), [&tensor]))
+    };
+    let negated = Pickle::new(2).raw(b"}").text("neg").raw(b"\x88s").0;
+    assert_eq!(values(&read(v2(b"N")), "w"), [1.0, 2.0]);
+    assert_eq!(values(&read(v2(b"}")), "w"), [1.0, 2.0]);
+    let error = Checkpoint::from_bytes(v2(&negated[2..])).unwrap_err();
+    assert!(error.kind() == ErrorKind::Unsupported && error.message().contains("marked to be negated"), "{error}");
+    let of_class = |module: &str, class: &str| {
+        let p = Pickle::new(2).raw(b"}").text("w").global("torch._tensor", "_rebuild_from_type_v2").raw(b"(");
+        let p = p.global("torch._utils", "_rebuild_tensor_v2").global(module, class).raw(b"(");
+        let p = p.storage("FloatStorage", "0", 2).int(0).ints(&[2]).ints(&[1]).raw(b"\x89").ordered_dict().raw(b"t");
+        pth::zip(&pth::entries(p.raw(b"}tRs").stop(), [&tensor]))
+    };
+    assert_eq!(values(&read(of_class("torch.nn.parameter", "Parameter")), "w"), [1.0, 2.0]);
+    let error = Checkpoint::from_bytes(of_class("torchao.dtypes", "AffineQuantizedTensor")).unwrap_err();
+    assert!(error.message().contains("a tensor of class \"torchao.dtypes.AffineQuantizedTensor\""), "{error}");
 }
 
 #[test]
@@ -292,10 +414,8 @@ fn files_are_known_by_their_content() {
     assert_eq!(message(b"").0, ErrorKind::Format);
     assert_eq!(
         message(b"hello").1,
-        "begins with bytes [68, 65, 6c, 6c, 6f], expected a zip as torch.save writes it (PK\\x03\\x04) or a safetensors header"
+        "begins with bytes [68, 65, 6c, 6c, 6f], expected a zip as torch.save writes it (PK\\x03\\x04), its older format, or a safetensors header"
     );
-    let legacy = message(b"\x80\x02\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19.\x80\x02M\xe9\x03.");
-    assert_eq!(legacy, (ErrorKind::Unsupported, "legacy torch.save pickle; re-save with torch >= 1.6".into()));
     assert_eq!(Checkpoint::open(dir.path().join("none")).unwrap_err().kind(), ErrorKind::Io);
 
     let with = |extra: Entry| {

@@ -12,6 +12,7 @@ mod small;
 mod damaged;
 mod drives;
 mod evaluation;
+mod outside;
 mod results;
 mod usage;
 
@@ -162,15 +163,21 @@ fn words(arguments: &[String]) -> Vec<&str> {
     arguments.iter().map(String::as_str).collect()
 }
 
+fn of_pth(tensors: &Tensors) -> Vec<(&str, pth::Tensor)> {
+    let mut all = Vec::new();
+    for (name, (shape, values)) in tensors {
+        let shape: Vec<i64> = shape.iter().map(|&v| v as i64).collect();
+        all.push((name.as_str(), pth::Tensor::f32(&shape, values)));
+    }
+    all
+}
+
 fn pth_bytes(tensors: &Tensors) -> Vec<u8> {
-    let tensors: Vec<(&str, pth::Tensor)> = tensors
-        .iter()
-        .map(|(name, (shape, values))| {
-            let shape: Vec<i64> = shape.iter().map(|&v| v as i64).collect();
-            (name.as_str(), pth::Tensor::f32(&shape, values))
-        })
-        .collect();
-    pth::pth(2, pth::Wrap::Runner, &tensors)
+    pth::pth(2, pth::Wrap::Runner, &of_pth(tensors))
+}
+
+fn legacy_bytes(tensors: &Tensors) -> Vec<u8> {
+    pth::legacy(pth::Wrap::Runner, &of_pth(tensors))
 }
 
 fn plain_bytes(tensors: &Tensors) -> Vec<u8> {

@@ -143,6 +143,36 @@ pub(crate) fn pth(protocol: u8, wrap: Wrap, tensors: &[(&str, Tensor)]) -> Vec<u
     zip(&entries(pickle(protocol, wrap, tensors), tensors.iter().map(|(_, t)| t)))
 }
 
+/// The first three pickles of a file without a zip: the number that it begins with, its version, and the machine.
+pub(crate) fn legacy_head() -> Vec<u8> {
+    let magic = Pickle::new(2).raw(b"\x8a\x0a\x6c\xfc\x9c\x46\xf9\x20\x6a\xa8\x50\x19").stop();
+    let machine = Pickle::new(2).raw(b"}(").text("protocol_version").int(1001).text("little_endian").raw(b"\x88");
+    let sizes = ["short", "int", "long"].iter().fold(machine.text("type_sizes").raw(b"}("), |p, t| p.text(t).int(4));
+    [magic, Pickle::new(2).int(1001).stop(), sizes.raw(b"uu").stop()].concat()
+}
+
+/// A file without a zip: a pickle, and storages by key, size of an element and bytes.
+pub(crate) fn legacy_of(pickle: Vec<u8>, storages: &[(&str, usize, Vec<u8>)]) -> Vec<u8> {
+    let keys = storages.iter().fold(Pickle::new(2).raw(b"]("), |p, (key, ..)| p.text(key)).raw(b"e").stop();
+    let mut file = [legacy_head(), pickle, keys].concat();
+    for (_, size, bytes) in storages {
+        file.extend(((bytes.len() / size) as i64).to_le_bytes());
+        file.extend(bytes);
+    }
+    file
+}
+
+/// The file without a zip that `torch.save(..., _use_new_zipfile_serialization=False)` writes of these tensors.
+pub(crate) fn legacy(wrap: Wrap, tensors: &[(&str, Tensor)]) -> Vec<u8> {
+    let keys: Vec<String> = (0..tensors.len()).map(|i| i.to_string()).collect();
+    let storage = |(key, (_, t)): (&String, &(&str, Tensor))| {
+        (key.clone(), t.bytes.len() / (t.numel as usize).max(1), t.bytes.clone())
+    };
+    let storages: Vec<_> = keys.iter().zip(tensors).map(storage).collect();
+    let storages: Vec<_> = storages.iter().map(|(key, size, bytes)| (key.as_str(), *size, bytes.clone())).collect();
+    legacy_of(pickle(2, wrap, tensors), &storages)
+}
+
 /// A `.pth` of any pickle and of 64 zero bytes under each of the given keys.
 pub(crate) fn pth_of(pickle: Vec<u8>, keys: &[&str]) -> Vec<u8> {
     let mut all = entries(pickle, []);

@@ -20,6 +20,7 @@ fn main() -> std::io::Result<()> {
         ("calibration", calibrations()),
         ("checkpoint", checkpoints()),
         ("image", images()),
+        ("legacy", legacy()),
         ("model", models()),
         ("npz", archives()),
         ("rig", rigs()),
@@ -64,15 +65,26 @@ fn drawn() -> Vec<(String, Vec<u8>)> {
 }
 
 fn calibrations() -> Vec<(String, Vec<u8>)> {
-    let matrix = "[[1,2,3,4],[5,6e-1,7,8],[9,10,11,12],[0,0,0,1.5]]";
+    let matrix = "[[1,2,3,4],[5,6e-1,7,8],[9,10,11,12],[0,0,0,1]]";
+    let pose = "[[0,-1,0,0.5],[0,0,-1,2.5e-1],[1,0,0,-2],[0,0,0,1]]";
     let direct = format!(r#"{{"name":"a","file":"img/a.png","width":20,"height":10,"lidar2img":{matrix}}}"#);
     let product = format!(
         r#"{{"name":"b","file":"b.png","width":20,"height":10,
-            "intrinsic":[[100,0,10],[0,200,5],[0,0,1]],"lidar2camera":{matrix}}}"#
+            "intrinsic":[[100,0,10],[0,200,5],[0,0,1]],"lidar2camera":{pose}}}"#
+    );
+    let more = product.replacen(
+        "\"intrinsic\"",
+        "\"distortion\":[0,0,0,0],\"camera_model\":\"pinhole\",\"x\":[1],\"intrinsic\"",
+        1,
     );
     let both = format!("{direct},{product}");
     let file = |cameras: &str| format!(r#"{{"source":null,"cameras":[{cameras}]}}"#).into_bytes();
-    vec![("direct".into(), file(&direct)), ("product".into(), file(&product)), ("both".into(), file(&both))]
+    vec![
+        ("direct".into(), file(&direct)),
+        ("product".into(), file(&product)),
+        ("both".into(), file(&both)),
+        ("more".into(), file(&more)),
+    ]
 }
 
 /// Files of every decoder and several colour types, behind their size.
@@ -90,14 +102,24 @@ fn images() -> Vec<(String, Vec<u8>)> {
         ("rgb.jpg", rgb.clone(), ImageFormat::Jpeg),
         ("grey.jpg", rgb.to_luma8().into(), ImageFormat::Jpeg),
     ];
-    kinds
+    let mut seeds: Vec<_> = kinds
         .map(|(name, image, format)| {
             let mut bytes = std::io::Cursor::new(vec![width as u8, height as u8]);
             bytes.set_position(2);
             image.write_to(&mut bytes, format).expect("memory to write to");
             (name.to_owned(), bytes.into_inner())
         })
-        .into()
+        .into();
+    // Every subsampling, restarts, progressive: the files of the library's tests, which `expected.json` gives the sizes of.
+    let place = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/images");
+    let expected = std::fs::read_to_string(place.join("expected.json")).expect("a file of this repository");
+    let expected: serde_json::Value = serde_json::from_str(&expected).expect("JSON");
+    for (name, size) in expected["images"].as_object().expect("images by name") {
+        let side = |key: &str| size[key].as_u64().expect("a number") as u8;
+        let file = std::fs::read(place.join(format!("{name}.jpg"))).expect("a file of this repository");
+        seeds.push((format!("{name}.jpg"), [&[side("width"), side("height")][..], &file].concat()));
+    }
+    seeds
 }
 
 /// A whole scene, and a header that asks for its data.
@@ -165,6 +187,25 @@ fn rigs() -> Vec<(String, Vec<u8>)> {
         ("lengths".into(), [[0, 4, 1, 0, 0], [2, 5, 1, 0, 0], [1, 6, 9, 0, 0]].concat()),
         ("file".into(), file),
     ]
+}
+
+/// Files without a zip, and the pickles in them.
+fn legacy() -> Vec<(String, Vec<u8>)> {
+    let values = [1.0, -2.0, 3.0, 0.5];
+    let half = Tensor::new("HalfStorage", &[2], 2, vec![0, 0x3c, 0, 0xc0]);
+    let tensors = [("module.w", Tensor::f32(&[2, 2], &values)), ("steps", half)];
+    let mut seeds = vec![];
+    for (wrap, name) in [(Wrap::Runner, "runner"), (Wrap::Bare, "bare"), (Wrap::Dict, "dict")] {
+        let file = pth::legacy(wrap, &tensors);
+        let head = pth::legacy_head().len();
+        seeds.push((format!("{name}.tail"), file[head..].to_vec()));
+        seeds.push((format!("{name}.pth"), file));
+        let fitting = tensors
+            .clone()
+            .map(|(name, t)| (name, Tensor { numel: if t.class == "HalfStorage" { 32 } else { 16 }, ..t }));
+        seeds.push((format!("{name}.pkl"), pth::pickle(2, wrap, &fitting)));
+    }
+    seeds
 }
 
 fn checkpoints() -> Vec<(String, Vec<u8>)> {

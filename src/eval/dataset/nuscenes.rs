@@ -10,7 +10,8 @@ mod tables;
 
 use super::{DataSet, Frame, Grid, Pose, Truth};
 use crate::base::error::{Error, Result};
-use crate::scene::{Scene, read_image};
+use crate::image::file::read_image;
+use crate::scene::Scene;
 use crate::synth::CLASSES;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -173,7 +174,7 @@ impl DataSet for NuScenes {
     fn frame(&self, index: usize) -> Result<Frame> {
         let mut scene = Scene { names: Vec::new(), images: Vec::new(), lidar2img: Vec::new() };
         for (camera, name) in self.entries[index].cameras.iter().zip(CAMERAS) {
-            scene.images.push(read_image(&self.root.join(&camera.filename), name, Some(camera.size))?);
+            scene.images.push(read_image(&self.root.join(&camera.filename), name, Some(camera.size), &mut Vec::new())?);
             scene.names.push(name.to_owned());
             scene.lidar2img.push(camera.lidar2img);
         }

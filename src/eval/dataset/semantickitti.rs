@@ -1,12 +1,14 @@
 //! SemanticKITTI's scene completion as it is published (arXiv 1904.01416): sequences of the KITTI odometry benchmark, and
-//! labelled voxels of every fifth frame.
+//! labelled voxels of every fifth scan, which the benchmark scores, or of every scan.
 //!
 //! Below `ROOT/sequences/NN`, `calib.txt`, `image_2/*.png` (and `image_3`) and `voxels/*.{label,invalid}` are read. What one
 //! sweep alone occupies (`.bin`) and what is `.occluded` from every place are no part of the score, and not read.
 
 use super::{Axes, DataSet, Frame, Grid, IGNORED, Pose, Truth};
 use crate::base::error::{Error, Result};
-use crate::scene::{Scene, check_finite, read_image};
+use crate::image::file::read_image;
+use crate::scene::matrix::{check_intrinsic, check_rigid};
+use crate::scene::{Scene, check_finite};
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -109,6 +111,25 @@ impl FromStr for Split {
     }
 }
 
+/// Which scans of a sequence.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Scans {
+    /// Every fifth, from 0 on: those that the benchmark scores. Labels of others are left out, and none may be missing.
+    #[default]
+    Benchmark,
+    /// All that have labels: the archive of all scans, or a choice of one's own.
+    Labelled,
+}
+
+/// Of so many scans, the benchmark scores the first.
+const EVERY: u32 = 5;
+
+impl Scans {
+    fn has(self, stem: &str) -> bool {
+        self == Scans::Labelled || stem.parse::<u32>().is_ok_and(|number| number % EVERY == 0)
+    }
+}
+
 /// SemanticKITTI: the frames with labels, in the order of sequence and number, without masks.
 #[derive(Clone, Debug)]
 pub struct SemanticKitti {
@@ -151,8 +172,9 @@ impl SemanticKitti {
     ///
     /// # Errors
     /// [`ErrorKind::Io`](crate::ErrorKind::Io) if a sequence of the split or its calibration cannot be read;
-    /// [`ErrorKind::Format`](crate::ErrorKind::Format) if the calibration is malformed or a sequence has no labels.
-    pub fn open(root: &Path, split: Split, stereo: bool) -> Result<Self> {
+    /// [`ErrorKind::Format`](crate::ErrorKind::Format) if the calibration is malformed, its `Tr` is not rigid or a projection
+    /// not upper triangular, a sequence has no labels, or an image of [`Scans::Benchmark`] none.
+    pub fn open(root: &Path, split: Split, stereo: bool, scans: Scans) -> Result<Self> {
         let names: &[(&str, &str)] =
             if stereo { &[("image_2", "P2"), ("image_3", "P3")] } else { &[("image_2", "P2")] };
         let mut set = Self { sequences: Vec::new(), frames: Vec::new() };
@@ -161,13 +183,28 @@ impl SemanticKitti {
             let path = directory.join("calib.txt");
             let text = std::fs::read_to_string(&path).map_err(|e| Error::io(&path, "read", &e))?;
             let cameras = names.iter().map(|&(name, key)| {
-                let lidar2img = product(&rows(&text, key)?, &rows(&text, "Tr")?);
+                let (camera2img, lidar2camera) = (rows(&text, key)?, rows(&text, "Tr")?);
+                check_matrices(key, &camera2img, &lidar2camera)?;
+                let lidar2img = product(&camera2img, &lidar2camera);
                 check_finite(name, &lidar2img)?;
                 Ok(Camera { name, lidar2img })
             });
             let cameras = cameras.collect::<Result<_>>().map_err(|e| e.in_file(&path))?;
             let sequence = set.sequences.len();
-            let stems = labelled(&directory.join("voxels"))?;
+            let voxels = directory.join("voxels");
+            let stems: Vec<String> = numbers(&voxels, ".label")?.into_iter().filter(|s| scans.has(s)).collect();
+            if stems.is_empty() {
+                return Err(Error::format("no labels, expected files such as 000005.label").in_file(&voxels));
+            }
+            let images = directory.join("image_2");
+            if scans == Scans::Benchmark && images.is_dir() {
+                let images = numbers(&images, ".png")?;
+                let missing = images.iter().find(|s| scans.has(s) && stems.binary_search(s).is_err());
+                if let Some(stem) = missing {
+                    let message = format!("no {stem}.label for image_2/{stem}.png, expected one for every fifth image");
+                    return Err(Error::format(message).in_file(&voxels));
+                }
+            }
             set.frames.extend(stems.into_iter().map(|s| Numbered { sequence, id: format!("{number:02}/{s}") }));
             set.sequences.push(Sequence { directory, cameras });
         }
@@ -175,17 +212,14 @@ impl SemanticKitti {
     }
 }
 
-/// The numbers of the frames in `directory` that have a `.label`, ascending.
-fn labelled(directory: &Path) -> Result<Vec<String>> {
+/// The numbers of the files in `directory` that end in `ending`, ascending.
+fn numbers(directory: &Path, ending: &str) -> Result<Vec<String>> {
     let failed = |e: &std::io::Error| Error::io(directory, "read", e);
     let mut stems = Vec::new();
     for entry in std::fs::read_dir(directory).map_err(|e| failed(&e))? {
         let name = entry.map_err(|e| failed(&e))?.file_name();
-        let stem = name.to_str().and_then(|n| n.strip_suffix(".label"));
+        let stem = name.to_str().and_then(|n| n.strip_suffix(ending));
         stems.extend(stem.filter(|s| !s.is_empty() && s.bytes().all(|b| b.is_ascii_digit())).map(str::to_owned));
-    }
-    if stems.is_empty() {
-        return Err(Error::format("no labels, expected files such as 000005.label").in_file(directory));
     }
     stems.sort_unstable();
     Ok(stems)
@@ -193,8 +227,11 @@ fn labelled(directory: &Path) -> Result<Vec<String>> {
 
 /// The 3x4 matrix of the line `key: ...` of a `calib.txt`.
 fn rows(text: &str, key: &str) -> Result<[[f64; 4]; 3]> {
-    let line = text.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix(':'));
-    let line = line.ok_or_else(|| Error::format(format!("no line \"{key}:\", expected one of 12 numbers")))?;
+    let mut lines = text.lines().filter_map(|line| line.strip_prefix(key)?.strip_prefix(':'));
+    let line = lines.next().ok_or_else(|| Error::format(format!("no line \"{key}:\", expected one of 12 numbers")))?;
+    if lines.next().is_some() {
+        return Err(Error::format(format!("two lines \"{key}:\", expected one")));
+    }
     let mut numbers = [0.0; 12];
     let mut found = 0;
     for word in line.split_whitespace() {
@@ -209,6 +246,14 @@ fn rows(text: &str, key: &str) -> Result<[[f64; 4]; 3]> {
         return Err(Error::format(format!("{key}: {found} numbers, expected 12")));
     }
     Ok(std::array::from_fn(|row| std::array::from_fn(|column| numbers[4 * row + column])))
+}
+
+/// Refuses a `Tr` that is not rigid, and a projection whose camera is not upper triangular.
+fn check_matrices(key: &str, camera2img: &[[f64; 4]; 3], lidar2camera: &[[f64; 4]; 3]) -> Result<()> {
+    let [a, b, c] = *lidar2camera;
+    let wrong = |key: &str, (found, expected)| Error::format(format!("{key}: {found}, expected {expected}"));
+    check_rigid(&[a, b, c, [0.0, 0.0, 0.0, 1.0]]).map_err(|e| wrong("Tr", e))?;
+    check_intrinsic(&camera2img.map(|[x, y, z, _]| [x, y, z])).map_err(|e| wrong(key, e))
 }
 
 /// Row-major 4x4 of first the rigid `lidar2camera`, then `camera2img`: computed in f64, rounded once.
@@ -266,7 +311,7 @@ impl DataSet for SemanticKitti {
         let mut scene = Scene { names: Vec::new(), images: Vec::new(), lidar2img: Vec::new() };
         for camera in &sequence.cameras {
             let path = sequence.directory.join(camera.name).join(format!("{}.png", frame.stem()));
-            scene.images.push(read_image(&path, camera.name, None)?);
+            scene.images.push(read_image(&path, camera.name, None, &mut Vec::new())?);
             scene.names.push(camera.name.to_owned());
             scene.lidar2img.push(camera.lidar2img);
         }

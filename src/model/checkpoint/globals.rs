@@ -69,6 +69,11 @@ pub(super) fn is_history_buffer(module: &str, name: &str) -> bool {
     (module, name) == ("mmengine.logging.history_buffer", "HistoryBuffer")
 }
 
+/// Whether `module.name` is a class of tensors whose elements are what is stored.
+pub(super) fn is_plain_tensor(module: &str, name: &str) -> bool {
+    matches!((module, name), ("torch", "Tensor") | ("torch.nn.parameter", "Parameter" | "Buffer"))
+}
+
 /// The name since Python 3 of a module that protocol 2 writes by its old one.
 fn modern(module: &str) -> &str {
     match module {

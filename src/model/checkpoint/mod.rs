@@ -19,6 +19,8 @@
 
 mod archive;
 mod globals;
+mod legacy;
+mod names;
 mod pickle;
 mod plain;
 mod pth;
@@ -26,40 +28,37 @@ mod tensor;
 
 pub use tensor::{Dtype, TensorView};
 
-use crate::base::error::{Error, ErrorKind, Result};
+use crate::base::error::{Error, Result};
+use crate::base::note::Note;
 use archive::Storage;
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use tensor::Tensor;
 
 /// The tensors of a checkpoint by name.
 ///
-/// Names are those of the state dict. A `module.` in front of *every* name, which `DataParallel` puts there, is dropped.
-/// Values of the state dict that are not tensors are not listed.
+/// Names are those of the state dict without what wrappers put in front, name by name: `module.` (`DataParallel`, moving
+/// averages), `_orig_mod.` (`torch.compile`, wherever it stands) and `model.`, also several. Where two tensors would get
+/// one name so, both keep theirs. Values of the state dict that are not tensors are not listed.
 pub struct Checkpoint {
     bytes: Bytes,
     contents: Contents,
+    /// Which tensors were asked for.
+    asked: Vec<AtomicBool>,
+    path: Option<PathBuf>,
 }
 
 /// What a reader of one of the formats finds.
+#[derive(Default)]
 struct Contents {
     storages: Vec<Storage>,
     tensors: Vec<Tensor>,
     /// Index into `tensors`; several names may share one.
     names: BTreeMap<String, usize>,
-}
-
-/// What `DataParallel` puts in front of every name.
-const PREFIX: &str = "module.";
-
-impl Contents {
-    fn without_prefix(mut self) -> Self {
-        if self.names.keys().all(|name| name.len() > PREFIX.len() && name.starts_with(PREFIX)) {
-            self.names = self.names.into_iter().map(|(name, i)| (name[PREFIX.len()..].to_owned(), i)).collect();
-        }
-        self
-    }
+    /// What is to be said.
+    notes: Vec<String>,
 }
 
 enum Bytes {
@@ -76,9 +75,6 @@ impl std::ops::Deref for Bytes {
         }
     }
 }
-
-/// How a pickle file that is not in a zip begins: protocol 2 and the number that `torch.save` wrote before 1.6.
-const LEGACY_MAGIC: &[u8] = &[0x80, 2, 0x8a, 10, 0x6c, 0xfc, 0x9c, 0x46, 0xf9, 0x20, 0x6a, 0xa8, 0x50, 0x19];
 
 impl Checkpoint {
     /// Maps and checks the checkpoint at `path`. Its content, not its extension, decides how it is read.
@@ -99,38 +95,73 @@ impl Checkpoint {
         // valid. That nobody shortens or rewrites the file meanwhile is the caller's part, stated above; no map can
         // enforce it.
         let map = unsafe { memmap2::Mmap::map(&file) }.map_err(io("map"))?;
-        Self::new(Bytes::Mapped(map)).map_err(|e| e.in_file(path))
+        let checkpoint = Self::new(Bytes::Mapped(map)).map_err(|e| e.in_file(path))?;
+        Ok(Self { path: Some(path.to_owned()), ..checkpoint })
     }
 
     /// Reads a checkpoint that is in memory.
     ///
     /// Every tensor is checked here: its storage exists, has the declared size, and holds every element that shape,
-    /// strides and offset reach. The bytes of a `.pth` tensor are checked against their CRC-32 when they are first
-    /// converted; a `.safetensors` file has no checksums.
+    /// strides and offset reach. The bytes of a tensor in a zip are checked against their CRC-32 when they are first
+    /// converted; a `.safetensors` file and a `.pth` without a zip have no checksums.
     ///
     /// # Errors
-    /// - [`ErrorKind::Format`]: truncated, corrupt or inconsistent bytes; a pickle that would call something.
-    /// - [`ErrorKind::Unsupported`]: a file of `torch.save` before 1.6, a TorchScript archive, big-endian tensors,
-    ///   encrypted entries, compression other than deflate.
-    /// - [`ErrorKind::TooLarge`]: more values or compressed bytes than a file of its size can justify.
+    /// - [`ErrorKind::Format`](crate::ErrorKind::Format): truncated, corrupt or inconsistent bytes; a pickle that would call
+    ///   something.
+    /// - [`ErrorKind::Unsupported`](crate::ErrorKind::Unsupported): a TorchScript archive, big-endian tensors, tensors of
+    ///   another class or marked to be negated, storages that are parts of others, encrypted entries, compression other
+    ///   than deflate.
+    /// - [`ErrorKind::TooLarge`](crate::ErrorKind::TooLarge): more values or compressed bytes than a file of its size can
+    ///   justify.
     pub fn from_bytes(bytes: Vec<u8>) -> Result<Self> {
         Self::new(Bytes::Owned(bytes))
     }
 
     fn new(bytes: Bytes) -> Result<Self> {
-        let contents = if bytes.starts_with(b"PK\x03\x04") {
+        let mut contents = if bytes.starts_with(b"PK\x03\x04") {
             pth::read(&bytes)?
-        } else if bytes.starts_with(LEGACY_MAGIC) {
-            return Err(Error::new(ErrorKind::Unsupported, "legacy torch.save pickle; re-save with torch >= 1.6"));
+        } else if legacy::is_legacy(&bytes) {
+            legacy::read(&bytes)?
         } else if plain::is_plain(&bytes) {
             plain::read(&bytes)?
         } else {
             let head = &bytes[..bytes.len().min(8)];
             return Err(Error::format(format!(
-                "begins with bytes {head:02x?}, expected a zip as torch.save writes it (PK\\x03\\x04) or a safetensors header"
+                "begins with bytes {head:02x?}, expected a zip as torch.save writes it (PK\\x03\\x04), its older format, or a \
+                 safetensors header"
             )));
         };
-        Ok(Self { bytes, contents: contents.without_prefix() })
+        let (names, replaced) = names::unwrap_all(contents.names);
+        contents.names = names;
+        if replaced > 0 {
+            contents.notes.push(format!("{replaced} names without module., _orig_mod. or model. in front"));
+        }
+        let asked = contents.tensors.iter().map(|_| AtomicBool::new(false)).collect();
+        Ok(Self { bytes, contents, asked, path: None })
+    }
+
+    /// What is to be said of the file: under which key its tensors are, if under another than `state_dict`, which other
+    /// states it has, and how many names had something in front.
+    pub fn notes(&self) -> Vec<Note> {
+        let note = |message: &String| {
+            let note = Note::new(message);
+            match &self.path {
+                Some(path) => note.in_file(path),
+                None => note,
+            }
+        };
+        self.contents.notes.iter().map(note).collect()
+    }
+
+    /// Names that [`Checkpoint::get`] was never asked for, in ascending order: after an import, what the model does not have.
+    pub fn unused(&self) -> impl Iterator<Item = &str> {
+        let names = self.contents.names.iter();
+        names.filter(|&(_, &index)| !self.asked[index].load(Ordering::Relaxed)).map(|(name, _)| name.as_str())
+    }
+
+    /// Up to three names that are most like `name`, for a message that it is missing.
+    pub fn nearest(&self, name: &str) -> Vec<&str> {
+        names::nearest(name, self.names())
     }
 
     /// Names of the tensors in ascending order of their bytes.
@@ -151,6 +182,7 @@ impl Checkpoint {
     /// The tensor called `name`.
     pub fn get(&self, name: &str) -> Option<TensorView<'_>> {
         let (name, &index) = self.contents.names.get_key_value(name)?;
+        self.asked[index].store(true, Ordering::Relaxed);
         let tensor = &self.contents.tensors[index];
         let storage = &self.contents.storages[tensor.storage];
         Some(TensorView { name, tensor, storage, file: &self.bytes })

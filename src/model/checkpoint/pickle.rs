@@ -36,7 +36,7 @@ pub(super) struct Text {
 #[derive(Debug)]
 pub(super) enum Value {
     None,
-    Bool,
+    Bool(bool),
     Int(i64),
     Str(Text),
     Tuple(Box<[Id]>),
@@ -83,7 +83,7 @@ impl Value {
     pub(super) fn kind(&self) -> &'static str {
         match self {
             Value::None => "None",
-            Value::Bool => "a bool",
+            Value::Bool(_) => "a bool",
             Value::Int(_) => "an int",
             Value::Str(_) => "a string",
             Value::Tuple(_) => "a tuple",
@@ -105,23 +105,38 @@ pub(super) struct Pickle<'a> {
 }
 
 impl<'a> Pickle<'a> {
-    /// Runs the pickle that fills `bytes`.
-    pub(super) fn parse(bytes: &'a [u8]) -> Result<Self> {
+    /// Runs the pickle that fills `bytes`, which messages call `what`.
+    pub(super) fn parse(bytes: &'a [u8], what: &'static str) -> Result<Self> {
         if bytes.len() > MAX_BYTES {
-            let message = format!("data.pkl has {} bytes, expected at most {MAX_BYTES}", bytes.len());
+            let message = format!("{what} has {} bytes, expected at most {MAX_BYTES}", bytes.len());
             return Err(Error::new(ErrorKind::TooLarge, message));
         }
-        let mut machine = Machine::new(bytes);
+        let (pickle, used) = Self::parse_first(bytes, what)?;
+        if used != bytes.len() {
+            let rest = bytes.len() - used;
+            return Err(Error::format(format!("{what}, byte {used}: stops {rest} bytes before the end of the entry")));
+        }
+        Ok(pickle)
+    }
+
+    /// Runs the pickle that `bytes` begin with, and says how many of them it takes.
+    pub(super) fn parse_first(bytes: &'a [u8], what: &'static str) -> Result<(Self, usize)> {
+        let mut machine = Machine::new(&bytes[..bytes.len().min(MAX_BYTES)], what);
         while machine.step()? {}
         let root = machine.pop()?;
         if !machine.stack.is_empty() || !machine.marks.is_empty() {
             return Err(machine.error("stops with more than one value on its stack"));
         }
-        if machine.at != bytes.len() {
-            let rest = bytes.len() - machine.at;
-            return Err(machine.error(format!("stops {rest} bytes before the end of the entry")));
-        }
-        Ok(Self { bytes, values: machine.values, root })
+        let used = machine.at;
+        Ok((Self { bytes, values: machine.values, root }, used))
+    }
+
+    /// Every storage that the pickle refers to, as often as it does.
+    pub(super) fn storages(&self) -> impl Iterator<Item = &StorageRef> {
+        self.values.iter().filter_map(|value| match value {
+            Value::Storage(storage) => Some(storage),
+            _ => None,
+        })
     }
 
     /// The value that the pickle is of.
@@ -158,11 +173,14 @@ fn sequence(values: &[Value], id: Id) -> Option<&[Id]> {
 
 /// Immutable values that every machine starts with, so that naming them costs nothing.
 const NONE: Id = Id(0);
-const BOOL: Id = Id(1);
-const EMPTY: Id = Id(2);
+const EMPTY: Id = Id(1);
+const FALSE: Id = Id(2);
+const TRUE: Id = Id(3);
 
 struct Machine<'a> {
     bytes: &'a [u8],
+    /// What messages call the pickle.
+    what: &'static str,
     /// Position of the next byte to read.
     at: usize,
     /// Position of the instruction that runs.
@@ -177,10 +195,10 @@ struct Machine<'a> {
 }
 
 impl<'a> Machine<'a> {
-    fn new(bytes: &'a [u8]) -> Self {
-        let values = vec![Value::None, Value::Bool, Value::Tuple(Box::default())];
+    fn new(bytes: &'a [u8], what: &'static str) -> Self {
+        let values = vec![Value::None, Value::Tuple(Box::default()), Value::Bool(false), Value::Bool(true)];
         let (stack, marks, memo) = (Vec::new(), Vec::new(), Vec::new());
-        Self { bytes, at: 0, op_at: 0, values, stack, marks, memo, copied: 0 }
+        Self { bytes, what, at: 0, op_at: 0, values, stack, marks, memo, copied: 0 }
     }
 
     fn error(&self, what: impl std::fmt::Display) -> Error {
@@ -188,7 +206,7 @@ impl<'a> Machine<'a> {
     }
 
     fn error_of(&self, kind: ErrorKind, what: impl std::fmt::Display) -> Error {
-        Error::new(kind, format!("data.pkl, byte {}: {what}", self.op_at))
+        Error::new(kind, format!("{}, byte {}: {what}", self.what, self.op_at))
     }
 
     fn get(&self, id: Id) -> &Value {
@@ -313,7 +331,8 @@ impl<'a> Machine<'a> {
             b'2' => self.stack.push(self.top()?),
             b'q' | b'r' | 0x94 | b'h' | b'j' => self.memo_op(op)?,
             b'N' => self.stack.push(NONE),
-            0x88 | 0x89 => self.stack.push(BOOL),
+            0x88 => self.stack.push(TRUE),
+            0x89 => self.stack.push(FALSE),
             b')' => self.stack.push(EMPTY),
             0x85..=0x87 => {
                 let id = self.pop_tuple(usize::from(op - 0x84))?;
@@ -435,12 +454,18 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    /// `('storage', class, key, location, numel)`.
+    /// `('storage', class, key, location, numel)`, and in files without a zip None behind it, or what the storage is a part
+    /// of.
     fn persistent(&mut self) -> Result<()> {
         let id = self.pop()?;
         let wrong = "a persistent id, expected ('storage', class, key, location, length)";
         let Value::Tuple(parts) = self.get(id) else { return Err(self.error(wrong)) };
-        let &[tag, class, key, location, numel] = &**parts else { return Err(self.error(wrong)) };
+        let &[tag, class, key, location, numel, ref view @ ..] = &**parts else { return Err(self.error(wrong)) };
+        match view {
+            [] => {}
+            &[view] if matches!(self.get(view), Value::None) => {}
+            _ => return Err(self.error_of(ErrorKind::Unsupported, "a storage that is a part of another")),
+        }
         let (Value::Str(tag), Value::Global { module, name }, Value::Str(key), Value::Str(_), &Value::Int(numel)) =
             (self.get(tag), self.get(class), self.get(key), self.get(location), self.get(numel))
         else {

@@ -4,7 +4,6 @@ use super::Contents;
 use super::archive::Storage;
 use super::tensor::{Dtype, Element, MAX_DIMS, Tensor};
 use crate::base::error::{Error, ErrorKind, Result};
-use std::collections::BTreeMap;
 
 /// Longest header that is read. Parsed JSON takes some ten times its text, and a name with its entry some 150 bytes.
 const MAX_HEADER: u64 = 16 << 20;
@@ -24,7 +23,7 @@ pub(super) fn read(bytes: &[u8]) -> Result<Contents> {
     let malformed = |e: safetensors::SafeTensorError| Error::format(format!("safetensors: {e}"));
     let (header, metadata) = safetensors::SafeTensors::read_metadata(bytes).map_err(malformed)?;
     let start = header + 8;
-    let mut contents = Contents { storages: Vec::new(), tensors: Vec::new(), names: BTreeMap::new() };
+    let mut contents = Contents::default();
     for (name, info) in metadata.tensors() {
         if info.shape.len() > MAX_DIMS {
             let dims = info.shape.len();

@@ -1,11 +1,12 @@
-//! The `.pth` reader: entries of the archive, the pickle's state dict, and where its tensors lie.
+//! The `.pth` reader: the pickle's state dict and where its tensors lie, in an archive or (`legacy`) behind the pickle.
 
 use super::Contents;
-use super::archive::Archive;
+use super::archive::{Archive, Storage};
+use super::legacy::Records;
 use super::pickle::{Id, Pickle, TensorRef, Value};
 use super::tensor::{MAX_DIMS, Tensor};
 use crate::base::error::{Error, ErrorKind, Result};
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 
 /// Newest archive version; `torch.save` writes 3, and nothing yet more than this.
 const MAX_VERSION: u32 = 10;
@@ -17,14 +18,17 @@ pub(super) fn read(file: &[u8]) -> Result<Contents> {
     check_kind(&mut archive, &folder)?;
     let entry = format!("{folder}data.pkl");
     let bytes = archive.bytes(&entry)?.ok_or_else(|| Error::format(format!("no zip entry {entry:?}")))?;
-    let pickle = Pickle::parse(&bytes)?;
-    let dict = state_dict(&pickle)?;
+    let pickle = Pickle::parse(&bytes, "data.pkl")?;
+    list(&pickle, Source::Archive(archive, folder))
+}
 
+/// Lists the tensors of a pickle's state dict, whose storages `source` has.
+pub(super) fn list(pickle: &Pickle<'_>, source: Source<'_>) -> Result<Contents> {
+    let (dict, notes) = state_dict(pickle)?;
     let mut reader = Reader {
-        pickle: &pickle,
-        archive,
-        folder,
-        contents: Contents { storages: Vec::new(), tensors: Vec::new(), names: BTreeMap::new() },
+        pickle,
+        source,
+        contents: Contents { notes, ..Contents::default() },
         keys: HashMap::new(),
         ids: HashMap::new(),
     };
@@ -37,9 +41,36 @@ pub(super) fn read(file: &[u8]) -> Result<Contents> {
     }
     let contents = reader.contents;
     if contents.names.is_empty() {
-        return Err(Error::format(format!("the state dict holds no tensors; {}", keys(&pickle, dict))));
+        return Err(Error::format(format!("the state dict holds no tensors; {}", keys(pickle, dict))));
     }
     Ok(contents)
+}
+
+/// Where the storages of a pickle lie.
+pub(super) enum Source<'a> {
+    /// In entries of an archive, in this folder.
+    Archive(Archive<'a>, String),
+    /// Behind the pickle.
+    Records(Records),
+}
+
+impl Source<'_> {
+    /// The storage that `key` names.
+    fn storage(&mut self, key: &[u8]) -> Result<Storage> {
+        let shown = String::from_utf8_lossy(&key[..key.len().min(40)]);
+        match self {
+            Source::Archive(archive, folder) => {
+                let missing = || Error::format(format!("no zip entry \"{folder}data/{shown}\" for its storage"));
+                let name = std::str::from_utf8(key).map_err(|_| missing())?;
+                archive.entry(&format!("{folder}data/{name}"))?.ok_or_else(missing)
+            }
+            Source::Records(records) => {
+                let found =
+                    records.get(key).ok_or_else(|| Error::format(format!("no storage {shown:?} behind the pickle")));
+                found.map(|range| Storage::unchecked(range.clone()))
+            }
+        }
+    }
 }
 
 /// The one top folder with its slash; `torch.save` names it after the file.
@@ -75,22 +106,46 @@ fn check_kind(archive: &mut Archive<'_>, folder: &str) -> Result<()> {
     Ok(())
 }
 
-/// The dict of tensors: under `state_dict` at the top, or the top itself.
-fn state_dict<'p>(pickle: &'p Pickle<'_>) -> Result<&'p [(Id, Id)]> {
+/// Keys under which frameworks put a dict of tensors, the one that counts first in front.
+const STATE_DICTS: [&str; 8] =
+    ["state_dict", "model_state_dict", "model", "module", "net", "ema_state_dict", "state_dict_ema", "model_ema"];
+
+/// The dict of tensors, and what is to be said of its choice: under a key of [`STATE_DICTS`] at the top, or the top itself.
+fn state_dict<'p>(pickle: &'p Pickle<'_>) -> Result<(&'p [(Id, Id)], Vec<String>)> {
     let Value::Dict(top) = pickle.root() else {
         return Err(Error::format(format!("the checkpoint is {}, expected a dict", pickle.root().kind())));
     };
-    let is_state_dict = |id| matches!(pickle.get(id), Value::Str(t) if pickle.text(*t) == b"state_dict");
     // As in Python, the last of equal keys counts.
-    match top.iter().rev().find(|(key, _)| is_state_dict(*key)).map(|&(_, value)| pickle.get(value)) {
-        Some(Value::Dict(dict)) => Ok(dict),
-        Some(other) => Err(Error::format(format!("state_dict is {}, expected a dict", other.kind()))),
-        None if top.iter().any(|&(_, value)| matches!(pickle.get(value), Value::Tensor(_))) => Ok(top),
-        None => {
-            let found = keys(pickle, top);
-            Err(Error::format(format!("no state_dict; {found}, expected state_dict or tensors by name")))
-        }
+    let under = |name: &str| {
+        let is_it = |id| matches!(pickle.get(id), Value::Str(t) if pickle.text(*t) == name.as_bytes());
+        top.iter().rev().find(|(key, _)| is_it(*key)).map(|&(_, value)| pickle.get(value))
+    };
+    match under("state_dict") {
+        None | Some(Value::Dict(_)) => {}
+        Some(other) => return Err(Error::format(format!("state_dict is {}, expected a dict", other.kind()))),
     }
+    let is_tensor = |&(_, value): &(Id, Id)| matches!(pickle.get(value), Value::Tensor(_));
+    if under("state_dict").is_none() && top.iter().any(is_tensor) {
+        return Ok((top, Vec::new()));
+    }
+    let dicts: Vec<_> = STATE_DICTS
+        .iter()
+        .filter_map(|&name| match under(name) {
+            Some(Value::Dict(dict)) if name == "state_dict" || dict.iter().any(is_tensor) => Some((name, dict)),
+            _ => None,
+        })
+        .collect();
+    let Some((&(used, dict), others)) = dicts.split_first() else {
+        let found = keys(pickle, top);
+        return Err(Error::format(format!("no state_dict; {found}, expected state_dict or tensors by name")));
+    };
+    let others: Vec<&str> = others.iter().map(|&(name, _)| name).collect();
+    let note = match (used, others.is_empty()) {
+        ("state_dict", true) => None,
+        (_, true) => Some(format!("the tensors are those under {used:?}")),
+        (_, false) => Some(format!("the tensors are those under {used:?}; not used: {}", others.join(", "))),
+    };
+    Ok((dict, Vec::from_iter(note)))
 }
 
 /// The first few keys of a dict, for a message.
@@ -108,10 +163,9 @@ fn keys(pickle: &Pickle<'_>, dict: &[(Id, Id)]) -> String {
 
 struct Reader<'p, 'a> {
     pickle: &'p Pickle<'p>,
-    archive: Archive<'a>,
-    folder: String,
+    source: Source<'a>,
     contents: Contents,
-    /// Storages by the name of their entry.
+    /// Storages by their key.
     keys: HashMap<&'p [u8], usize>,
     /// Tensors by their value, for one may have several names.
     ids: HashMap<Id, usize>,
@@ -172,10 +226,7 @@ impl<'p> Reader<'p, '_> {
         let index = match self.keys.get(key) {
             Some(&index) => index,
             None => {
-                let shown = String::from_utf8_lossy(&key[..key.len().min(40)]);
-                let missing = || Error::format(format!("no zip entry \"{}data/{shown}\" for its storage", self.folder));
-                let name = std::str::from_utf8(key).map_err(|_| missing())?;
-                let found = self.archive.entry(&format!("{}data/{name}", self.folder))?.ok_or_else(missing)?;
+                let found = self.source.storage(key)?;
                 self.contents.storages.push(found);
                 self.keys.insert(key, self.contents.storages.len() - 1);
                 self.contents.storages.len() - 1

@@ -40,7 +40,7 @@ pub(super) fn read_occ3d(path: &Path) -> Result<(Vec<u8>, Vec<Vec<u8>>)> {
         };
         let array = arrays.swap_remove(at);
         let OwnedElements::U8(values) = array.elements else {
-            return Err(failed(format!("array \"{name}\" has elements of another type, expected {expected}")));
+            return Err(failed(format!("array \"{name}\" is {}, expected {expected}", array.elements.kind())));
         };
         if array.shape != OCC3D.size {
             return Err(failed(format!("array \"{name}\" has shape {:?}, expected {expected}", array.shape)));

@@ -5,6 +5,7 @@ use super::super::{Pose, is_inside};
 use super::{CAMERAS, Camera, Entry, LIDAR, Scenes};
 use crate::base::error::{Error, Result};
 use crate::scene::check_finite;
+use crate::scene::matrix::check_intrinsic;
 use serde::de::{DeserializeOwned, DeserializeSeed, Deserializer, SeqAccess, Visitor};
 use std::collections::HashMap;
 use std::fs::File;
@@ -272,7 +273,11 @@ fn intrinsic(rows: &[Vec<f64>]) -> Result<[[f64; 3]; 3]> {
     let row = |row: &Vec<f64>| <[f64; 3]>::try_from(row.as_slice()).ok();
     let rows: Option<Vec<[f64; 3]>> = rows.iter().map(row).collect();
     let rows = rows.and_then(|rows| <[[f64; 3]; 3]>::try_from(rows).ok());
-    rows.ok_or_else(|| Error::format("camera_intrinsic of another shape, expected 3 rows of 3 numbers"))
+    let rows = rows.ok_or_else(|| Error::format("camera_intrinsic of another shape, expected 3 rows of 3 numbers"))?;
+    match check_intrinsic(&rows) {
+        Ok(()) => Ok(rows),
+        Err((found, expected)) => Err(Error::format(format!("camera_intrinsic: {found}, expected {expected}"))),
+    }
 }
 
 fn pose(rotation: &[f64], translation: &[f64]) -> Result<Pose> {

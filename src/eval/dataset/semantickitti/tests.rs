@@ -63,7 +63,7 @@ impl Place {
     }
 
     fn open(&self) -> Result<SemanticKitti> {
-        SemanticKitti::open(self.root(), Split::Val, false)
+        SemanticKitti::open(self.root(), Split::Val, false, Scans::Benchmark)
     }
 }
 
@@ -152,7 +152,7 @@ fn cameras_by_hand() {
     // A point (x, y, z) is at (-y, -z - 0.5, x + 0.25) of the camera.
     let left = [50.0, -100.0, 0.0, 22.5, 20.0, 0.0, -200.0, -99.0, 1.0, 0.0, 0.0, 0.75, 0.0, 0.0, 0.0, 1.0];
     assert_eq!(frame.scene.lidar2img, [left]);
-    let stereo = SemanticKitti::open(place.root(), Split::Sequence(9), true).expect("a set");
+    let stereo = SemanticKitti::open(place.root(), Split::Sequence(9), true, Scans::Benchmark).expect("a set");
     let scene = stereo.frame(0).expect("a frame").scene;
     assert_eq!((stereo.id(0), &scene.names[..]), ("09/000010", &["image_2".to_owned(), "image_3".to_owned()][..]));
     assert_eq!(scene.images[1].bgr[0], 102);
@@ -179,7 +179,7 @@ fn splits_are_the_published_ones() {
 fn what_is_missing_or_malformed_is_named() {
     let place = Place::new();
     let refused = |split, expected: &str, file: &Path| {
-        let error = SemanticKitti::open(place.root(), split, false).expect_err(expected);
+        let error = SemanticKitti::open(place.root(), split, false, Scans::Benchmark).expect_err(expected);
         assert!(error.path() == Some(file) && error.message().contains(expected), "{error}");
     };
     refused(Split::Train, "cannot read", &place.path("00").join("calib.txt"));
@@ -190,6 +190,11 @@ fn what_is_missing_or_malformed_is_named() {
         ("P2: 1 0 0 0 0 1 0 0 0 0 1 0 5\nTr: 1 0 0 0 0 1 0 0 0 0 1 0\n", "P2: 13 numbers, expected 12"),
         ("P2: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: 1 0 0 0 0 1 0 0 nan 0 1 0\n", "Tr: \"nan\", expected a finite number"),
         ("P2: 1e39 0 0 0 0 1 0 0 0 0 1 0\nTr: 1 0 0 0 0 1 0 0 0 0 1 0\n", "lidar2img[0][0] is inf"),
+        ("P2: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: 2 0 0 0 0 2 0 0 0 0 2 0\n", "Tr: scaled: row 0"),
+        ("P2: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: 1 0 0 0 0 1 0 0 0 0 -1 0\n", "Tr: mirrored"),
+        ("P2: 1 0 0 0 0 1 0 0 5 5 1 0\nTr: 1 0 0 0 0 1 0 0 0 0 1 0\n", "P2: 5 in row 2, column 0"),
+        ("P2: 2 0 0 0 0 2 0 0 0 0 2 0\nTr: 1 0 0 0 0 1 0 0 0 0 1 0\n", "P2: 2 in row 2, column 2"),
+        ("P2: 1 0 0 0 0 1 0 0 0 0 1 0\nP2: 1 0 0 0 0 1 0 0 0 0 1 0\n", "two lines \"P2:\""),
     ] {
         fs::write(&calibration, text).expect("written");
         refused(Split::Sequence(9), expected, &calibration);
@@ -217,4 +222,32 @@ fn what_is_missing_or_malformed_is_named() {
     fs::remove_file(voxels.join("000000.label")).expect("removed");
     fs::remove_file(voxels.join("000005.label")).expect("removed");
     refused(Split::Val, "no labels, expected files such as", &voxels);
+}
+
+#[test]
+fn the_benchmark_is_every_fifth_scan() {
+    let place = Place::new();
+    let voxels = place.path("08").join("voxels");
+    for number in 0..12 {
+        place.labels("08", &format!("{number:06}"), &[], &[]);
+    }
+    let ids = |scans| {
+        let set = SemanticKitti::open(place.root(), Split::Val, false, scans).expect("a set");
+        (0..set.len()).map(|i| set.id(i).to_owned()).collect::<Vec<_>>()
+    };
+    assert_eq!(ids(Scans::Benchmark), ["08/000000", "08/000005", "08/000010"]);
+    assert_eq!(ids(Scans::Labelled).len(), 12);
+    // What the benchmark does not score may be as it likes.
+    fs::remove_file(voxels.join("000003.invalid")).expect("removed");
+    fs::write(voxels.join("000004.label"), "no label").expect("written");
+    let set = place.open().expect("a set");
+    (0..set.len()).for_each(|i| drop(set.truth(i).expect("labels")));
+    // An image that it scores, and no label for it.
+    place.images("08", "000015");
+    let error = place.open().expect_err("a label is missing");
+    assert!(
+        error.path() == Some(&*voxels) && error.message().contains("no 000015.label for image_2/000015.png"),
+        "{error}"
+    );
+    assert_eq!(ids(Scans::Labelled).len(), 12);
 }

@@ -47,15 +47,28 @@ impl<'a> Machine<'a> {
                 [data, ..] if matches!(self.get(data), Value::Tensor(_)) => return Ok(data),
                 _ => return Err(wrong(self)),
             },
-            Callable::Tensor | Callable::TensorV3 => self.tensor(callable, &parts).ok_or_else(|| wrong(self))?,
+            Callable::Tensor | Callable::TensorV3 => {
+                self.refuse_marks(callable, &parts)?;
+                self.tensor(callable, &parts).ok_or_else(|| wrong(self))?
+            }
             Callable::FromType => {
-                let [function, _, args, ..] = parts[..] else { return Err(wrong(self)) };
+                let [function, class, args, ..] = parts[..] else { return Err(wrong(self)) };
                 let (callable, function) = self.callable(function)?;
                 if !matches!(callable, Callable::Tensor | Callable::TensorV3) {
                     return Err(self.refusal(&function));
                 }
+                let &Value::Global { module, name: class } = self.get(class) else { return Err(wrong(self)) };
+                if !self.name_of(module, class).is_some_and(|(m, n)| globals::is_plain_tensor(m, n)) {
+                    let class = self.quote(module, class);
+                    let what = format!(
+                        "a tensor of class {class}, expected a plain one: its elements may mean something else"
+                    );
+                    return Err(self.error_of(ErrorKind::Unsupported, what));
+                }
                 let Value::Tuple(parts) = self.get(args) else { return Err(wrong(self)) };
-                self.tensor(callable, parts).ok_or_else(|| wrong(self))?
+                let parts = parts[..parts.len().min(8)].to_vec();
+                self.refuse_marks(callable, &parts)?;
+                self.tensor(callable, &parts).ok_or_else(|| wrong(self))?
             }
             Callable::GetAttr => {
                 let [object, attribute] = parts[..] else { return Err(self.refusal(&name)) };
@@ -108,6 +121,19 @@ impl<'a> Machine<'a> {
         }
         self.copied = copied;
         Ok(Some(Value::Dict(dict)))
+    }
+
+    /// Refuses a tensor that is marked as the negative or the conjugate of what is stored.
+    fn refuse_marks(&self, callable: Callable, args: &[Id]) -> Result<()> {
+        let metadata = args.get(if callable == Callable::TensorV3 { 7 } else { 6 });
+        match metadata.map(|&id| self.get(id)) {
+            None | Some(Value::None) => Ok(()),
+            Some(Value::Dict(marks)) if marks.is_empty() => Ok(()),
+            Some(_) => {
+                let what = "a tensor whose elements are marked to be negated or conjugated, expected them as they are; save a clone()";
+                Err(self.error_of(ErrorKind::Unsupported, what))
+            }
+        }
     }
 
     /// `(storage, offset, size, stride, requires_grad, hooks, element type)`, as many of them as `callable` needs.
