@@ -2,30 +2,26 @@
 //!
 //! Every kernel takes an [`Isa`] value and borrowed slices; none does I/O, allocates, starts threads or keeps state.
 //! Tensors are channels last.
+//!
+//! - [`isa`]: which instructions there are, as values that prove it.
+//! - `simd`: sixteen virtual lanes, a file per instruction set.
+//! - [`matmul`]: the matrix product and the layout of its weights.
+//! - [`ops`]: a file per operation. Each is also at the root of the crate.
+//! - [`math`], [`peak`]: exp and sigmoid, and the machine's own ceiling.
+//!
+//! Without the default feature `std` the crate needs `core` alone.
+#![cfg_attr(not(any(test, feature = "std")), no_std)]
 
-pub mod conv;
-pub mod deconv3d;
-pub mod deform_conv2d;
-pub mod depthwise;
-pub mod gate;
-pub mod gather;
-pub mod head;
 pub mod isa;
 pub mod math;
-pub mod max_pool;
-pub mod normalise;
-pub mod panels;
+pub mod matmul;
+pub mod ops;
 pub mod peak;
-pub mod pool;
-pub mod product;
-pub mod project;
-pub mod scale_shift;
 mod simd;
 #[cfg(test)]
 mod testing;
-pub mod upsample_add;
-pub mod window_attention;
 
 pub use isa::{Isa, IsaError};
-pub use panels::Panels;
-pub use simd::{LANES, relu};
+pub use matmul::{self as product, Panels, layout as panels};
+pub use ops::*;
+pub use simd::{LANES, Tile, relu};

@@ -1,13 +1,46 @@
-//! exp and sigmoid as one fixed polynomial each: no libm, so the same bits everywhere.
+//! exp and sigmoid as one fixed polynomial each: no library's exp, so the same bits everywhere.
 
 use crate::simd::Simd;
+
+/// What `std` adds to f32, for `core` alone. Every one of them is correctly rounded, so the bits are the same.
+#[cfg(not(feature = "std"))]
+pub(crate) trait Float {
+    /// `self * a + b`, rounded once.
+    fn mul_add(self, a: f32, b: f32) -> f32;
+    /// The largest integer that is not above.
+    fn floor(self) -> f32;
+    /// The square root.
+    fn sqrt(self) -> f32;
+    /// The nearest integer, ties to even.
+    fn round_ties_even(self) -> f32;
+}
+
+#[cfg(not(feature = "std"))]
+impl Float for f32 {
+    #[inline(always)]
+    fn mul_add(self, a: f32, b: f32) -> f32 {
+        libm::fmaf(self, a, b)
+    }
+    #[inline(always)]
+    fn floor(self) -> f32 {
+        libm::floorf(self)
+    }
+    #[inline(always)]
+    fn sqrt(self) -> f32 {
+        libm::sqrtf(self)
+    }
+    #[inline(always)]
+    fn round_ties_even(self) -> f32 {
+        libm::rintf(self)
+    }
+}
 
 /// Arguments outside are clamped: below, exp is under the smallest normal f32; above, it overflows.
 const EXP_MIN: f32 = -87.0;
 const EXP_MAX: f32 = 88.0;
-const LOG2_E: f32 = std::f32::consts::LOG2_E;
+const LOG2_E: f32 = core::f32::consts::LOG2_E;
 /// ln 2 in two parts (Cody and Waite, 1980). The products are fused, so the high part may use every bit of an f32.
-const LN2_HI: f32 = std::f32::consts::LN_2;
+const LN2_HI: f32 = core::f32::consts::LN_2;
 const LN2_LO: f32 = -1.904_654_3e-9;
 /// Taylor coefficients 1/7! to 1/0!, adequate on |r| <= ln 2 / 2: the truncation is below 1e-8 of the result.
 const EXP_POLY: [f32; 8] = [1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0];

@@ -1,16 +1,16 @@
 //! The machine's own ceiling: fused multiply-adds that never leave the registers.
 
 use crate::isa::Isa;
-use crate::simd::{Kernel, LANES, Simd, dispatch, tree_sum};
+#[cfg(not(feature = "std"))]
+use crate::math::Float as _;
+use crate::simd::{Kernel, LANES, Simd, TileRows, dispatch, tree_sum};
 
-/// Independent chains: enough to cover the latency of every vector unit, few enough to stay in registers.
+/// Independent chains of the specification: enough to cover the latency of every unit.
 const CHAINS: usize = 6;
-/// The same with 32 registers: a chain is one of them instead of two.
-const WIDE_CHAINS: usize = 12;
 
 /// Where lane `i` of chain `c` starts. All differ, or the compiler would compute equal registers once.
 fn start(c: usize) -> [f32; LANES] {
-    std::array::from_fn(|i| 0.25 + 0.01 * (c * LANES + i) as f32)
+    core::array::from_fn(|i| 0.25 + 0.01 * (c * LANES + i) as f32)
 }
 
 /// Runs `rounds` rounds of register-only multiply-adds and returns how many it did. The caller takes the time; what is
@@ -26,31 +26,41 @@ impl Kernel for Rounds {
 
     #[inline(always)]
     fn reference(self) -> (u64, f32) {
-        let mut sums: [f32; CHAINS] = std::array::from_fn(|c| start(c)[0]);
+        let mut sums: [f32; CHAINS] = core::array::from_fn(|c| start(c)[0]);
         for _ in 0..self.0 {
-            sums.iter_mut().for_each(|s| *s = s.mul_add(0.999, 0.001));
+            sums = sums.map(|sum| sum.mul_add(0.999, 0.001));
         }
         ((self.0 * CHAINS) as u64, sums.iter().sum::<f32>() / CHAINS as f32)
     }
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) -> (u64, f32) {
-        if S::WIDE { self.chains::<S, WIDE_CHAINS>(s) } else { self.chains::<S, CHAINS>(s) }
+        let mut result = (0, 0.0);
+        s.rows(usize::MAX, Chains { rounds: self.0, result: &mut result });
+        result
     }
 }
 
-impl Rounds {
+/// As many independent chains as a register tile has rows: enough to cover the latency of every vector unit, few enough
+/// to stay in registers.
+struct Chains<'a> {
+    rounds: usize,
+    result: &'a mut (u64, f32),
+}
+
+impl<S: Simd> TileRows<S> for Chains<'_> {
     #[inline(always)]
-    fn chains<S: Simd, const N: usize>(self, s: S) -> (u64, f32) {
+    fn run<const N: usize>(self, s: S) {
         let (scale, shift) = (s.splat(0.999), s.splat(0.001));
-        let mut sums: [S::V; N] = std::array::from_fn(|c| s.load(&start(c)));
-        for _ in 0..self.0 {
+        let mut sums: [S::V; N] = core::array::from_fn(|c| s.load(&start(c)));
+        for _ in 0..self.rounds {
             for sum in &mut sums {
                 *sum = s.mul_add(*sum, scale, shift);
             }
         }
         let total = sums.iter().fold(s.splat(0.0), |a, b| s.add(a, *b));
-        ((self.0 * N * LANES) as u64, tree_sum(s.lanes(total)) / (N * LANES) as f32)
+        let lanes = N * LANES;
+        *self.result = ((self.rounds * lanes) as u64, tree_sum(s.lanes(total)) / lanes as f32);
     }
 }
 

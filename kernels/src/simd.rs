@@ -4,17 +4,35 @@
 //! always has [`LANES`] lanes, whatever the register width (AVX2 uses a pair of registers, AVX-512 one), so that packed
 //! weights, partial sums and tails look the same everywhere. The scalar instruction set has no vector: it runs the
 //! kernel's `reference`, which is the specification.
+//!
+//! A file per instruction set implements [`Simd`] for its token and says which register tile suits it.
 
 use crate::isa::Isa;
 use half::f16;
 
 #[cfg(target_arch = "x86_64")]
-mod avx2;
+pub(crate) mod avx2;
 #[cfg(target_arch = "x86_64")]
-mod avx512;
+pub(crate) mod avx512;
+pub(crate) mod scalar;
 
 /// Lanes of a vector on every instruction set, and columns of a packed weight panel.
 pub const LANES: usize = 16;
+
+/// What a product computes in registers at once.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Tile {
+    /// Rows.
+    pub rows: usize,
+    /// Vectors of [`LANES`] columns.
+    pub panels: usize,
+}
+
+/// Work that is compiled for every number of rows that a tile can have.
+pub(crate) trait TileRows<S: Simd> {
+    /// Does `N` rows. Must be `#[inline(always)]`.
+    fn run<const N: usize>(self, s: S);
+}
 
 /// The vector operations of one instruction set.
 ///
@@ -23,9 +41,17 @@ pub const LANES: usize = 16;
 pub(crate) trait Simd: Copy {
     /// Sixteen f32 lanes.
     type V: Copy;
-    /// Whether there are 32 registers of 16 lanes, so that a tile can have 24 accumulators. Otherwise there are 16 of 8
-    /// lanes, which leave room for 6 accumulators.
-    const WIDE: bool;
+    /// Sixteen lanes of 32-bit integers.
+    type I: Copy;
+    /// Sixteen truth values.
+    type M: Copy;
+    /// The largest register tile: as many accumulators as fit beside the weights and a broadcast.
+    const TILE: Tile;
+    /// Whether a part of a vector is loaded and stored as fast as a whole one.
+    const MASKED: bool;
+
+    /// Calls `body` for as many rows as a tile can have and `left`, which is not 0, allow. Returns how many those were.
+    fn rows<B: TileRows<Self>>(self, left: usize, body: B) -> usize;
 
     /// All lanes `x`.
     fn splat(self, x: f32) -> Self::V;
@@ -60,8 +86,27 @@ pub(crate) trait Simd: Copy {
     /// 2 to the power `n`, for integral lanes from -126 to 127.
     fn exp2_int(self, n: Self::V) -> Self::V;
 
+    /// All integer lanes `x`.
+    fn splat_int(self, x: u32) -> Self::I;
+    /// Whole part of each lane, for lanes from 0 up to 2^31; any integer for others.
+    fn truncate(self, a: Self::V) -> Self::I;
+    /// `a >> bits`, for `bits` below 32, with zeros shifted in.
+    fn shift_right(self, a: Self::I, bits: u32) -> Self::I;
+    /// `a + b` modulo 2^32.
+    fn add_int(self, a: Self::I, b: Self::I) -> Self::I;
+    /// `a * b` modulo 2^32.
+    fn mul_int(self, a: Self::I, b: Self::I) -> Self::I;
+    /// `a` where `mask` holds, else 0.
+    fn keep(self, mask: Self::M, a: Self::I) -> Self::I;
+    /// Writes 16 integer lanes.
+    fn store_int(self, x: &mut [u32; LANES], v: Self::I);
+    /// `a >= b` in every lane: false where either is NaN.
+    fn at_least(self, a: Self::V, b: Self::V) -> Self::M;
+    /// Where both hold.
+    fn both(self, a: Self::M, b: Self::M) -> Self::M;
+
     /// Names the cache line of `p` to the first-level cache. Any address will do; nothing is read.
-    fn prefetch(self, p: *const f32);
+    fn prefetch<T>(self, p: *const T);
 
     /// Reads 16 lanes.
     #[inline(always)]
@@ -114,7 +159,7 @@ pub(crate) trait Simd: Copy {
     }
 }
 
-/// Rectifier of the specification: `if x < 0 { 0 } else { x }`, so that NaN stays visible.
+/// ReLU of the specification: `if x < 0 { 0 } else { x }`, so that NaN stays visible.
 #[inline(always)]
 pub fn relu(x: f32) -> f32 {
     if x < 0.0 { 0.0 } else { x }
@@ -136,47 +181,19 @@ pub(crate) trait Kernel: Sized {
     /// What the call returns.
     type Output;
     /// The specification: plain loops in the order of the bit contract. Must be `#[inline(always)]`, like everything in
-    /// it that multiplies and adds; see [`scalar`].
+    /// it that multiplies and adds; see [`scalar::run`].
     fn reference(self) -> Self::Output;
     /// The same bits with vectors. Must be `#[inline(always)]`.
     fn run<S: Simd>(self, s: S) -> Self::Output;
 }
 
-/// Runs `kernel` on `isa`.
+/// Runs `kernel` on `isa`: the one door to every body.
 #[inline]
 pub(crate) fn dispatch<K: Kernel>(isa: Isa, kernel: K) -> K::Output {
     match isa {
-        Isa::Scalar => scalar(
-            #[inline(always)]
-            || kernel.reference(),
-        ),
-        #[cfg(target_arch = "x86_64")]
-        Isa::Avx2(token) => {
-            // SAFETY: the token proves that this CPU has AVX2, FMA and F16C.
-            unsafe { avx2::run(token, kernel) }
-        }
-        #[cfg(target_arch = "x86_64")]
-        Isa::Avx512(token) => {
-            // SAFETY: the token proves that this CPU has AVX-512 F, VL, DQ and BW besides AVX2, FMA and F16C.
-            unsafe { avx512::run(token, kernel) }
-        }
-        #[cfg(not(target_arch = "x86_64"))]
-        Isa::Avx2(_) | Isa::Avx512(_) => unreachable!("the token is never made on this architecture"),
+        Isa::Scalar => scalar::run(kernel),
+        Isa::Avx2(token) => token.run(kernel),
+        Isa::Avx512(token) => token.run(kernel),
+        Isa::Neon(token) => token.run(kernel),
     }
-}
-
-/// Calls `specification`, compiled so that `f32::mul_add` is the CPU's instruction if it has one. Compiled for any x86-64
-/// it is a call of the C library per multiply-add. Both round once, so the bits are the same; nothing else changes.
-#[inline]
-pub(crate) fn scalar<R>(specification: impl FnOnce() -> R) -> R {
-    #[cfg(target_arch = "x86_64")]
-    if std::arch::is_x86_feature_detected!("fma") {
-        #[target_feature(enable = "fma")]
-        fn with_fma<R>(specification: impl FnOnce() -> R) -> R {
-            specification()
-        }
-        // SAFETY: this CPU has FMA.
-        return unsafe { with_fma(specification) };
-    }
-    specification()
 }

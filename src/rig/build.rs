@@ -24,8 +24,8 @@ use crate::network::Network;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use voxcast_kernels::Isa;
 use voxcast_kernels::project::project_points;
+use voxcast_kernels::{Isa, LANES};
 
 /// Rows of one matrix. A gibibyte of row pointers; `nuscenes-256` has 2^18.
 const MAX_ROWS: u128 = 1 << 28;
@@ -38,9 +38,6 @@ const MAX_COLUMN: u128 = 1 << 24;
 
 /// Slabs per level: enough to even out columns that few and columns that many cameras see.
 const SLABS: usize = 128;
-
-/// Points that the kernel takes at once; lines of sample points are padded to a multiple with points that hit nothing.
-const LANES: usize = 8;
 
 /// Builds [`Rig`]s of one network and number of cameras, on the calling thread or those of [`RigBuilder::with_threads`].
 ///

@@ -1,6 +1,6 @@
 //! AVX2 + FMA + F16C: a vector is a pair of 8-lane registers.
 
-use super::{Kernel, LANES, Simd};
+use super::{Kernel, LANES, Simd, Tile, TileRows};
 use crate::isa::Avx2;
 use core::arch::x86_64::*;
 use half::f16;
@@ -10,7 +10,7 @@ use half::f16;
 /// # Safety
 /// The CPU must have AVX2, FMA and F16C, which an [`Avx2`] token proves.
 #[target_feature(enable = "avx2,fma,f16c")]
-pub(super) unsafe fn run<K: Kernel>(token: Avx2, kernel: K) -> K::Output {
+pub(crate) unsafe fn run<K: Kernel>(token: Avx2, kernel: K) -> K::Output {
     kernel.run(token)
 }
 
@@ -24,7 +24,24 @@ macro_rules! halves {
 
 impl Simd for Avx2 {
     type V = [__m256; 2];
-    const WIDE: bool = false;
+    type I = [__m256i; 2];
+    type M = [__m256; 2];
+    // 12 accumulators of 8 lanes, 2 registers of weights and broadcasts, the most that 16 registers hold.
+    const TILE: Tile = Tile { rows: 6, panels: 1 };
+    const MASKED: bool = false;
+
+    #[inline(always)]
+    fn rows<B: TileRows<Self>>(self, left: usize, body: B) -> usize {
+        match left {
+            6.. => body.run::<6>(self),
+            5 => body.run::<5>(self),
+            4 => body.run::<4>(self),
+            3 => body.run::<3>(self),
+            2 => body.run::<2>(self),
+            _ => body.run::<1>(self),
+        }
+        left.min(6)
+    }
 
     #[inline(always)]
     fn splat(self, x: f32) -> Self::V {
@@ -92,7 +109,52 @@ impl Simd for Avx2 {
         })
     }
     #[inline(always)]
-    fn prefetch(self, p: *const f32) {
+    fn splat_int(self, x: u32) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        unsafe { [_mm256_set1_epi32(x.cast_signed()); 2] }
+    }
+    #[inline(always)]
+    fn truncate(self, a: Self::V) -> Self::I {
+        halves!(_mm256_cvttps_epi32(a))
+    }
+    #[inline(always)]
+    fn shift_right(self, a: Self::I, bits: u32) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        a.map(|a| unsafe { _mm256_srl_epi32(a, _mm_cvtsi32_si128(bits.cast_signed())) })
+    }
+    #[inline(always)]
+    fn add_int(self, a: Self::I, b: Self::I) -> Self::I {
+        halves!(_mm256_add_epi32(a, b))
+    }
+    #[inline(always)]
+    fn mul_int(self, a: Self::I, b: Self::I) -> Self::I {
+        halves!(_mm256_mullo_epi32(a, b))
+    }
+    #[inline(always)]
+    fn keep(self, mask: Self::M, a: Self::I) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        unsafe { [0, 1].map(|i| _mm256_and_si256(_mm256_castps_si256(mask[i]), a[i])) }
+    }
+    #[inline(always)]
+    fn store_int(self, x: &mut [u32; LANES], v: Self::I) {
+        let p = x.as_mut_ptr().cast::<__m256i>();
+        // SAFETY: the array holds two times 32 bytes, written unaligned; the token proves AVX2.
+        unsafe {
+            _mm256_storeu_si256(p, v[0]);
+            _mm256_storeu_si256(p.add(1), v[1]);
+        }
+    }
+    #[inline(always)]
+    fn at_least(self, a: Self::V, b: Self::V) -> Self::M {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        unsafe { [0, 1].map(|i| _mm256_cmp_ps::<_CMP_GE_OQ>(a[i], b[i])) }
+    }
+    #[inline(always)]
+    fn both(self, a: Self::M, b: Self::M) -> Self::M {
+        halves!(_mm256_and_ps(a, b))
+    }
+    #[inline(always)]
+    fn prefetch<T>(self, p: *const T) {
         // SAFETY: a prefetch is a hint that never faults; x86-64 always has it.
         unsafe { _mm_prefetch::<_MM_HINT_T0>(p.cast()) }
     }

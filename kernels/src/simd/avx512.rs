@@ -1,6 +1,6 @@
 //! AVX-512 F, VL, DQ and BW: a vector is one 16-lane register, and a part of one is a mask.
 
-use super::{Kernel, LANES, Simd};
+use super::{Kernel, LANES, Simd, Tile, TileRows};
 use crate::isa::Avx512;
 use core::arch::x86_64::*;
 use half::f16;
@@ -10,7 +10,7 @@ use half::f16;
 /// # Safety
 /// The CPU must have AVX-512 F, VL, DQ and BW, AVX2, FMA and F16C, which an [`Avx512`] token proves.
 #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma,f16c")]
-pub(super) unsafe fn run<K: Kernel>(token: Avx512, kernel: K) -> K::Output {
+pub(crate) unsafe fn run<K: Kernel>(token: Avx512, kernel: K) -> K::Output {
     kernel.run(token)
 }
 
@@ -30,7 +30,22 @@ macro_rules! lanewise {
 
 impl Simd for Avx512 {
     type V = __m512;
-    const WIDE: bool = true;
+    type I = __m512i;
+    type M = __mmask16;
+    // 24 accumulators and 2 registers of weights in 32 registers; each broadcast serves two multiply-adds, so that loads do
+    // not limit the speed.
+    const TILE: Tile = Tile { rows: 12, panels: 2 };
+    const MASKED: bool = true;
+
+    #[inline(always)]
+    fn rows<B: TileRows<Self>>(self, left: usize, body: B) -> usize {
+        match left {
+            12.. => (body.run::<12>(self), 12).1,
+            6.. => (body.run::<6>(self), 6).1,
+            3.. => (body.run::<3>(self), 3).1,
+            _ => (body.run::<1>(self), 1).1,
+        }
+    }
 
     #[inline(always)]
     fn splat(self, x: f32) -> Self::V {
@@ -92,7 +107,44 @@ impl Simd for Avx512 {
         })
     }
     #[inline(always)]
-    fn prefetch(self, p: *const f32) {
+    fn splat_int(self, x: u32) -> Self::I {
+        lanewise!(_mm512_set1_epi32(x.cast_signed()))
+    }
+    #[inline(always)]
+    fn truncate(self, a: Self::V) -> Self::I {
+        lanewise!(_mm512_cvttps_epi32(a))
+    }
+    #[inline(always)]
+    fn shift_right(self, a: Self::I, bits: u32) -> Self::I {
+        lanewise!(_mm512_srl_epi32(a, _mm_cvtsi32_si128(bits.cast_signed())))
+    }
+    #[inline(always)]
+    fn add_int(self, a: Self::I, b: Self::I) -> Self::I {
+        lanewise!(_mm512_add_epi32(a, b))
+    }
+    #[inline(always)]
+    fn mul_int(self, a: Self::I, b: Self::I) -> Self::I {
+        lanewise!(_mm512_mullo_epi32(a, b))
+    }
+    #[inline(always)]
+    fn keep(self, mask: Self::M, a: Self::I) -> Self::I {
+        lanewise!(_mm512_maskz_mov_epi32(mask, a))
+    }
+    #[inline(always)]
+    fn store_int(self, x: &mut [u32; LANES], v: Self::I) {
+        // SAFETY: the array is 64 bytes, written unaligned; the token proves AVX-512 F.
+        unsafe { _mm512_storeu_si512(x.as_mut_ptr().cast(), v) }
+    }
+    #[inline(always)]
+    fn at_least(self, a: Self::V, b: Self::V) -> Self::M {
+        lanewise!(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(a, b))
+    }
+    #[inline(always)]
+    fn both(self, a: Self::M, b: Self::M) -> Self::M {
+        a & b
+    }
+    #[inline(always)]
+    fn prefetch<T>(self, p: *const T) {
         // SAFETY: a prefetch is a hint that never faults; x86-64 always has it.
         unsafe { _mm_prefetch::<_MM_HINT_T0>(p.cast()) }
     }

@@ -11,21 +11,16 @@ use crate::graph::weights::{Dense, Values, Weights, matmul, packed, padded};
 use std::ops::Range;
 use voxcast_kernels::LANES;
 use voxcast_kernels::conv::Geometry;
+use voxcast_kernels::matmul::{BLOCK_ROWS, Product, Residual, SCRATCH};
 use voxcast_kernels::panels::packed_len;
-use voxcast_kernels::product::{Product, Residual, SCRATCH};
-
-/// Most rows that one worker takes at a time: one block of the product kernel.
-const BLOCK_ROWS: usize = 96;
-/// Rows that the product kernel computes at once.
-const TILE_ROWS: usize = 6;
 
 /// Bytes of scratch of the product kernel.
 pub(super) const SCRATCH_BYTES: usize = SCRATCH * size_of::<f32>();
 
-/// Rows of a tile: as many tiles as blocks of rows, but the same number for every worker.
+/// Rows of a tile: as many tiles as the kernel has blocks of rows, but the same number for every worker.
 pub(super) fn rows_per_tile(site: &Site<'_>, machine: Machine) -> usize {
     let tiles = site.rows().div_ceil(BLOCK_ROWS).next_multiple_of(machine.workers);
-    site.rows().div_ceil(tiles).next_multiple_of(TILE_ROWS)
+    site.rows().div_ceil(tiles).next_multiple_of(machine.isa.tile().rows)
 }
 
 /// Weight and bias.

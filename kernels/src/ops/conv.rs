@@ -11,9 +11,11 @@
 //! needs none: its rows lie in memory already.
 
 use crate::isa::Isa;
-use crate::product::{DEPTH, PIECES, Product, Rows, Source};
+use crate::matmul::Product;
+use crate::matmul::driver::{DEPTH, PIECES, Source};
+use crate::matmul::product::Rows;
 use crate::simd::Simd;
-use std::ops::Range;
+use core::ops::Range;
 
 /// How a convolution walks its input. The axes are depth, height, width.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -86,7 +88,7 @@ pub struct Conv<'a> {
 }
 
 /// Convolves the output rows `rows` (positions in depth, height, width order) into `out`, which holds exactly those rows,
-/// `stride` numbers apart. `scratch` holds [`crate::product::SCRATCH`] numbers of any value.
+/// `stride` numbers apart. `scratch` holds [`crate::matmul::SCRATCH`] numbers of any value.
 ///
 /// # Panics
 /// If a slice does not have the size that the shapes ask for.
@@ -169,6 +171,7 @@ impl Conv<'_> {
 }
 
 impl Source for Conv<'_> {
+    type Element = f32;
     type At = [usize; 3];
     type Part = Stretch;
 

@@ -1,10 +1,12 @@
 //! The specification: plain loops, no panels but those of the stored weights.
 
 use super::{QUERY_KERNEL, Scratch, Shape, WindowAttention, tree_max};
+#[cfg(not(feature = "std"))]
+use crate::math::Float as _;
 use crate::math::exp;
-use crate::panels::{packed_index, packed_len};
+use crate::matmul::layout::{packed_index, packed_len};
 use crate::simd::{LANES, relu, tree_sum};
-use std::ops::Range;
+use core::ops::Range;
 
 impl WindowAttention<'_> {
     /// The token's position in the plane as (row within the call's rows, column), or `None` if it is padding.

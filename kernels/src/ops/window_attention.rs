@@ -35,9 +35,11 @@ mod tests;
 
 use self::body::HALF;
 use crate::isa::Isa;
-use crate::panels::packed_len;
+#[cfg(not(feature = "std"))]
+use crate::math::Float as _;
+use crate::matmul::layout::packed_len;
 use crate::simd::{Kernel, LANES, Simd, dispatch};
-use std::ops::Range;
+use core::ops::Range;
 
 /// Side of a window in a plane that has room for it.
 pub const SIDE: usize = 7;
@@ -206,7 +208,7 @@ struct Scratch<'a> {
 impl<'a> Scratch<'a> {
     fn new(shape: &Shape, mut scratch: &'a mut [f32]) -> Self {
         let [offsets, window, qkv, plane, query, packed, scores, head, heads, proj] = shape.regions().map(|len| {
-            let (part, rest) = std::mem::take(&mut scratch).split_at_mut(len);
+            let (part, rest) = core::mem::take(&mut scratch).split_at_mut(len);
             scratch = rest;
             part
         });

@@ -21,7 +21,7 @@ pub fn normalise(image: &[u8], height: usize, width: usize, padded_width: usize,
         if !pixels.is_empty() {
             let from = &image[(first_row + i) * width * 3..][..width * 3];
             for (to, from) in pixels.as_chunks_mut::<3>().0.iter_mut().zip(from.as_chunks::<3>().0) {
-                *to = std::array::from_fn(|c| f32::from(from[c]) - BGR_MEAN[c]);
+                *to = core::array::from_fn(|c| f32::from(from[c]) - BGR_MEAN[c]);
             }
         }
     }

@@ -12,12 +12,12 @@
 //! every comparison and so is invalid. Strides are powers of two: dividing a coordinate by one is exact, hence
 //! `floor(u / stride)` is a shift of the integer part.
 //!
-//! The AVX2 body computes eight z at once, the terms of x and y once per line, and ends lines that are no multiple of
-//! eight with the specification. AVX-512 takes it too: most of the time goes into divisions, which wider registers do
-//! not speed up.
+//! The body computes sixteen z at once, and the terms of x and y once per line.
 
 use crate::isa::Isa;
-use crate::simd::scalar;
+#[cfg(not(feature = "std"))]
+use crate::math::Float as _;
+use crate::simd::{Kernel, LANES, Simd, dispatch};
 
 /// Rounding of the products: in which order, and with which roundings, a row is multiplied with a point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -88,28 +88,6 @@ impl Projection {
     }
 }
 
-/// The specification. Writes `out[(i * ys.len() + j) * zs.len() + k]` for point (xs\[i\], ys\[j\], zs\[k\]): its flat
-/// pixel, or 0 where it hits none. Returns whether any point hits one.
-///
-/// # Panics
-/// If `out` does not hold one element per point, or `p` breaks a rule of its fields.
-#[inline(always)]
-fn reference(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
-    p.check([xs.len(), ys.len(), zs.len()], out);
-    let mut any = 0;
-    let mut at = 0;
-    for &x in xs {
-        for &y in ys {
-            for &z in zs {
-                out[at] = p.pixel(x, y, z);
-                any |= out[at];
-                at += 1;
-            }
-        }
-    }
-    any != 0
-}
-
 /// Projects the points (xs\[i\], ys\[j\], zs\[k\]) as the module says: `out[(i * ys.len() + j) * zs.len() + k]` becomes the
 /// flat pixel that the point hits, or 0 where it hits none. Returns whether any point hits one.
 ///
@@ -119,128 +97,135 @@ fn reference(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]
 /// # Determinism
 /// The same on every instruction set.
 pub fn project_points(isa: Isa, p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
-    match isa {
-        Isa::Scalar => scalar(
-            #[inline(always)]
-            || reference(p, xs, ys, zs, out),
-        ),
-        #[cfg(target_arch = "x86_64")]
-        Isa::Avx2(_) | Isa::Avx512(_) => {
-            // SAFETY: the token in `isa` proves that this CPU has AVX2 and FMA.
-            unsafe { avx2::project_points(p, xs, ys, zs, out) }
-        }
-        #[cfg(not(target_arch = "x86_64"))]
-        Isa::Avx2(_) | Isa::Avx512(_) => unreachable!("the token is never made on this architecture"),
+    p.check([xs.len(), ys.len(), zs.len()], out);
+    dispatch(isa, Run { p, xs, ys, zs, out })
+}
+
+struct Run<'a> {
+    p: &'a Projection,
+    xs: &'a [f32],
+    ys: &'a [f32],
+    zs: &'a [f32],
+    out: &'a mut [u32],
+}
+
+impl Run<'_> {
+    /// Every line of constant x and y, with its place in the output.
+    #[inline(always)]
+    fn lines(&mut self) -> impl Iterator<Item = (f32, f32, &mut [u32])> {
+        let points = self.xs.iter().flat_map(|&x| self.ys.iter().map(move |&y| (x, y)));
+        // No points on a line: there is no output either.
+        points.zip(self.out.chunks_exact_mut(self.zs.len().max(1))).map(|((x, y), line)| (x, y, line))
+    }
+
+    /// Whether any point hit a pixel.
+    #[inline(always)]
+    fn hits(&self) -> bool {
+        self.out.iter().fold(0, |all, pixel| all | pixel) != 0
     }
 }
 
-#[cfg(target_arch = "x86_64")]
-mod avx2 {
-    use super::{Projection, Sum};
-    use std::arch::x86_64::*;
+impl Kernel for Run<'_> {
+    type Output = bool;
 
-    /// The constants of a camera, one per lane.
-    struct Lanes {
-        width: __m256,
-        height: __m256,
-        pixels_per_row: __m256i,
-        base: __m256i,
-        shift: __m128i,
-    }
-
-    /// The specification, eight points at a time and equal to it in every bit.
-    ///
-    /// # Panics
-    /// As the specification.
-    ///
-    /// # Safety
-    /// The CPU must have AVX2 and FMA.
-    #[target_feature(enable = "avx2,fma")]
-    pub(super) fn project_points(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
-        p.check([xs.len(), ys.len(), zs.len()], out);
-        match p.sum {
-            Sum::Chain => lines::<false>(p, xs, ys, zs, out),
-            Sum::Pairs => lines::<true>(p, xs, ys, zs, out),
+    #[inline(always)]
+    fn reference(mut self) -> bool {
+        let (p, zs) = (self.p, self.zs);
+        for (x, y, line) in self.lines() {
+            for (&z, out) in zs.iter().zip(line) {
+                *out = p.pixel(x, y, z);
+            }
         }
+        self.hits()
     }
 
-    #[target_feature(enable = "avx2,fma")]
-    fn lines<const PAIRS: bool>(p: &Projection, xs: &[f32], ys: &[f32], zs: &[f32], out: &mut [u32]) -> bool {
-        let lanes = Lanes {
-            width: _mm256_set1_ps((p.width - 1) as f32),
-            height: _mm256_set1_ps((p.height - 1) as f32),
-            pixels_per_row: _mm256_set1_epi32((p.width >> p.stride_log2) as i32),
-            base: _mm256_set1_epi32(p.base as i32),
-            shift: _mm_cvtsi32_si128(p.stride_log2 as i32),
-        };
-        let slope: [__m256; 3] = std::array::from_fn(|r| _mm256_set1_ps(p.matrix[r * 4 + 2]));
-        let whole = zs.len() - zs.len() % 8;
-        let mut any = _mm256_setzero_si256();
-        let mut any_tail = 0;
-        let mut rest = out;
-        for &x in xs {
-            for &y in ys {
-                let line;
-                (line, rest) = rest.split_at_mut(zs.len());
-                // PAIRS: (first + slope * z) + second; else fma(slope, z, first) + second.
-                let (first, second) = line_terms::<PAIRS>(p, x, y);
-                for (z, out) in zs.chunks_exact(8).zip(line.chunks_exact_mut(8)) {
-                    // SAFETY: `chunks_exact(8)` yields 8 floats; the load needs no alignment.
-                    let z = unsafe { _mm256_loadu_ps(z.as_ptr()) };
-                    let dots: [__m256; 3] = std::array::from_fn(|r| {
-                        let head = if PAIRS {
-                            _mm256_add_ps(first[r], _mm256_mul_ps(slope[r], z))
-                        } else {
-                            _mm256_fmadd_ps(slope[r], z, first[r])
-                        };
-                        _mm256_add_ps(head, second[r])
-                    });
-                    let pixel = pixels(&lanes, dots);
-                    any = _mm256_or_si256(any, pixel);
-                    // SAFETY: `chunks_exact_mut(8)` yields 8 u32; the store needs no alignment.
-                    unsafe { _mm256_storeu_si256(out.as_mut_ptr().cast(), pixel) };
-                }
-                for (&z, out) in zs[whole..].iter().zip(&mut line[whole..]) {
-                    *out = p.pixel(x, y, z);
-                    any_tail |= *out;
+    #[inline(always)]
+    fn run<S: Simd>(mut self, s: S) -> bool {
+        match self.p.sum {
+            Sum::Chain => self.all::<S, false>(s),
+            Sum::Pairs => self.all::<S, true>(s),
+        }
+        self.hits()
+    }
+}
+
+impl Run<'_> {
+    #[inline(always)]
+    fn all<S: Simd, const PAIRS: bool>(&mut self, s: S) {
+        let (p, zs) = (self.p, self.zs);
+        let pixels = Pixels::new(s, p);
+        let slope = [2, 6, 10].map(|at| s.splat(p.matrix[at]));
+        for (x, y, line) in self.lines() {
+            // PAIRS: (first + slope * z) + second; else fma(slope, z, first) + second.
+            let [first, second] = line_terms::<S, PAIRS>(s, p, x, y);
+            for (z, out) in zs.chunks(LANES).zip(line.chunks_mut(LANES)) {
+                let z = s.load_part(z);
+                let dots: [S::V; 3] = core::array::from_fn(|r| {
+                    let head =
+                        if PAIRS { s.add(first[r], s.mul(slope[r], z)) } else { s.mul_add(slope[r], z, first[r]) };
+                    s.add(head, second[r])
+                });
+                let pixel = pixels.flat(s, dots);
+                match out.first_chunk_mut() {
+                    Some(out) => s.store_int(out, pixel),
+                    None => {
+                        let mut lanes = [0; LANES];
+                        s.store_int(&mut lanes, pixel);
+                        out.copy_from_slice(&lanes[..out.len()]);
+                    }
                 }
             }
         }
-        any_tail != 0 || _mm256_testz_si256(any, any) == 0
+    }
+}
+
+/// The constants of a camera, one per lane.
+struct Pixels<S: Simd> {
+    last_column: S::V,
+    last_row: S::V,
+    pixels_per_row: S::I,
+    base: S::I,
+    stride_log2: u32,
+}
+
+impl<S: Simd> Pixels<S> {
+    #[inline(always)]
+    fn new(s: S, p: &Projection) -> Self {
+        Self {
+            last_column: s.splat((p.width - 1) as f32),
+            last_row: s.splat((p.height - 1) as f32),
+            pixels_per_row: s.splat_int(p.width >> p.stride_log2),
+            base: s.splat_int(p.base),
+            stride_log2: p.stride_log2,
+        }
     }
 
-    /// What a line of constant x and y adds before and after the term of z.
-    #[target_feature(enable = "avx2,fma")]
-    fn line_terms<const PAIRS: bool>(p: &Projection, x: f32, y: f32) -> ([__m256; 3], [__m256; 3]) {
-        let row = |r: usize| &p.matrix[r * 4..r * 4 + 4];
-        let first = std::array::from_fn(|r| {
-            let m = row(r);
-            _mm256_set1_ps(if PAIRS { m[0] * x } else { y.mul_add(m[1], m[0] * x) })
-        });
-        let second = std::array::from_fn(|r| {
-            let m = row(r);
-            _mm256_set1_ps(if PAIRS { m[1] * y + m[3] } else { m[3] })
-        });
-        (first, second)
+    /// Products of sixteen points to flat pixels; 0 where invalid.
+    #[inline(always)]
+    fn flat(&self, s: S, [u, v, d]: [S::V; 3]) -> S::I {
+        let (u, v, zero) = (s.div(u, d), s.div(v, d), s.splat(0.0));
+        let inside = |t: S::V, last: S::V| s.both(s.at_least(t, zero), s.at_least(last, t));
+        let valid = s.both(s.at_least(d, zero), s.both(inside(u, self.last_column), inside(v, self.last_row)));
+        // Lanes that are not valid truncate to anything; the mask drops them.
+        let column = s.shift_right(s.truncate(u), self.stride_log2);
+        let row = s.shift_right(s.truncate(v), self.stride_log2);
+        s.keep(valid, s.add_int(s.add_int(s.mul_int(row, self.pixels_per_row), column), self.base))
     }
+}
 
-    /// Products of eight points to flat pixels; 0 where invalid.
-    #[target_feature(enable = "avx2,fma")]
-    fn pixels(lanes: &Lanes, [u, v, d]: [__m256; 3]) -> __m256i {
-        let zero = _mm256_setzero_ps();
-        let u = _mm256_div_ps(u, d);
-        let v = _mm256_div_ps(v, d);
-        // Ordered comparisons: NaN is false.
-        let in_u = _mm256_and_ps(_mm256_cmp_ps::<_CMP_GE_OQ>(u, zero), _mm256_cmp_ps::<_CMP_LE_OQ>(u, lanes.width));
-        let in_v = _mm256_and_ps(_mm256_cmp_ps::<_CMP_GE_OQ>(v, zero), _mm256_cmp_ps::<_CMP_LE_OQ>(v, lanes.height));
-        let ahead = _mm256_cmp_ps::<_CMP_GE_OQ>(d, zero);
-        let valid = _mm256_castps_si256(_mm256_and_ps(ahead, _mm256_and_ps(in_u, in_v)));
-        // Lanes that are not valid convert to anything; the mask drops them.
-        let u = _mm256_srl_epi32(_mm256_cvttps_epi32(u), lanes.shift);
-        let v = _mm256_srl_epi32(_mm256_cvttps_epi32(v), lanes.shift);
-        let flat = _mm256_add_epi32(_mm256_add_epi32(_mm256_mullo_epi32(v, lanes.pixels_per_row), u), lanes.base);
-        _mm256_and_si256(flat, valid)
-    }
+/// What a line of constant x and y adds before and after the term of z.
+#[inline(always)]
+fn line_terms<S: Simd, const PAIRS: bool>(s: S, p: &Projection, x: f32, y: f32) -> [[S::V; 3]; 2] {
+    let row = |r: usize| &p.matrix[r * 4..r * 4 + 4];
+    let first = core::array::from_fn(|r| {
+        let m = row(r);
+        s.splat(if PAIRS { m[0] * x } else { y.mul_add(m[1], m[0] * x) })
+    });
+    let second = core::array::from_fn(|r| {
+        let m = row(r);
+        s.splat(if PAIRS { m[1] * y + m[3] } else { m[3] })
+    });
+    [first, second]
 }
 
 #[cfg(test)]
@@ -262,7 +247,7 @@ mod tests {
 
     fn one(p: &Projection, [x, y, z]: [f32; 3]) -> u32 {
         let mut out = [7];
-        let any = reference(p, &[x], &[y], &[z], &mut out);
+        let any = project_points(Isa::Scalar, p, &[x], &[y], &[z], &mut out);
         assert_eq!(any, out[0] != 0);
         out[0]
     }
@@ -313,21 +298,21 @@ mod tests {
     #[test]
     #[should_panic(expected = "one pixel per sample point")]
     fn short_output_is_refused() {
-        reference(&pinhole(), &[0.0], &[0.0], &[1.0, 2.0], &mut [0]);
+        project_points(Isa::Scalar, &pinhole(), &[0.0], &[0.0], &[1.0, 2.0], &mut [0]);
     }
 
     #[test]
     #[should_panic(expected = "flat pixels fit 32 bits")]
     fn overflowing_base_is_refused() {
         let p = Projection { base: u32::MAX - 30, ..pinhole() };
-        reference(&p, &[0.0], &[0.0], &[1.0], &mut [0]);
+        project_points(Isa::Scalar, &p, &[0.0], &[0.0], &[1.0], &mut [0]);
     }
 
     #[test]
     #[should_panic(expected = "a multiple of the stride")]
     fn ragged_image_is_refused() {
         let p = Projection { width: 60, ..pinhole() };
-        reference(&p, &[0.0], &[0.0], &[1.0], &mut [0]);
+        project_points(Isa::Scalar, &p, &[0.0], &[0.0], &[1.0], &mut [0]);
     }
 
     fn number() -> impl Strategy<Value = f32> {
@@ -379,7 +364,7 @@ mod tests {
         ) {
             let mut expected = vec![1; xs.len() * ys.len() * zs.len()];
             let mut found = vec![2; expected.len()];
-            let any = reference(&p, &xs, &ys, &zs, &mut expected);
+            let any = project_points(Isa::Scalar, &p, &xs, &ys, &zs, &mut expected);
             for isa in Isa::available() {
                 prop_assert_eq!(any, project_points(isa, &p, &xs, &ys, &zs, &mut found));
                 prop_assert_eq!(&expected, &found);
@@ -394,7 +379,7 @@ mod tests {
             let p = Projection { sum, ..pinhole() };
             let mut expected = vec![0; axis.len().pow(3)];
             let mut found = expected.clone();
-            reference(&p, &axis, &axis, &axis, &mut expected);
+            project_points(Isa::Scalar, &p, &axis, &axis, &axis, &mut expected);
             for isa in Isa::available() {
                 project_points(isa, &p, &axis, &axis, &axis, &mut found);
                 assert_eq!(expected, found);

@@ -10,12 +10,13 @@
 //! k runs over (t_d, t_h, t_w, c) ascending. Weights are eight packed matrices of `8 * channels` rows, one after the
 //! other, parity `(p_d * 2 + p_h) * 2 + p_w`; [`kernel_tap`] says which of the four taps each of their rows is.
 
-use crate::conv::{Conv, Geometry};
 use crate::isa::Isa;
-use crate::panels::{Panels, packed_len};
-use crate::product::{Product, Residual, Source, Target, product};
+use crate::matmul::driver::{Source, Target};
+use crate::matmul::layout::packed_len;
+use crate::matmul::{Panels, Product, Residual};
+use crate::ops::conv::{Conv, Geometry};
 use crate::simd::{Kernel, Simd, dispatch};
-use std::ops::Range;
+use core::ops::Range;
 
 /// Index into the kernel's four taps of tap `tap` (0 or 1) of the sub-convolution for parity `parity`.
 pub const fn kernel_tap(parity: usize, tap: usize) -> usize {
@@ -44,7 +45,7 @@ pub struct Deconv3d<'a> {
 }
 
 /// Computes the planes `planes` of the output's first axis into `out`, which holds exactly those, densely. `scratch`
-/// holds [`crate::product::SCRATCH`] numbers of any value.
+/// holds [`crate::matmul::SCRATCH`] numbers of any value.
 ///
 /// # Panics
 /// If a slice does not have the size that the shapes ask for.
@@ -181,7 +182,7 @@ impl Kernel for Run<'_> {
     fn run<S: Simd>(self, s: S) {
         self.each(
             #[inline(always)]
-            |conv, rows, target, out, scratch| product(s, &conv.product, conv, target, rows, out, scratch),
+            |conv, rows, target, out, scratch| conv.product.compute(s, conv, target, rows, out, scratch),
         );
     }
 }
@@ -189,8 +190,8 @@ impl Kernel for Run<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::panels::pack;
-    use crate::product::SCRATCH;
+    use crate::matmul::SCRATCH;
+    use crate::matmul::layout::pack;
     use crate::testing::{
         Fill, Rng, Tally, assert_close, assert_lively, assert_order_shows, assert_same_bits, pad_rows,
         reverse_channels, reverse_columns, round_to,

@@ -14,6 +14,8 @@
 //! one vector too.
 
 use crate::isa::Isa;
+#[cfg(not(feature = "std"))]
+use crate::math::Float as _;
 use crate::math::{exp_v, sigmoid};
 use crate::simd::{Kernel, LANES, Simd, dispatch, tree_sum};
 

@@ -2,14 +2,10 @@
 
 use super::{QUERY_KERNEL, SIDE, Scratch, Shape, WindowAttention, tree_max};
 use crate::math::exp_v;
-use crate::panels::packed_len;
-use crate::simd::{LANES, Simd, relu, tree_sum};
-use std::ops::Range;
+use crate::matmul::layout::packed_len;
+use crate::simd::{LANES, Simd, TileRows, relu, tree_sum};
+use core::ops::Range;
 
-/// Rows of a tile: 12 accumulators of 8 lanes, the most that AVX2 holds beside weights and a broadcast.
-const TILE: usize = 6;
-/// The same with 32 registers: as many accumulators, of 16 lanes.
-const WIDE_TILE: usize = 12;
 /// Zeros before and after each axis of the queries.
 pub(super) const HALF: usize = QUERY_KERNEL / 2;
 
@@ -251,41 +247,33 @@ fn product<S: Simd>(s: S, a: Rows<'_>, weights: &[f32], bias: Option<&[f32]>, ou
         let mut r = 0;
         while r < rows {
             let a = Rows { values: &a.values[r * a.stride..], ..a };
-            let out = &mut out[r * columns + i * LANES..];
-            macro_rules! tile {
-                ($n:expr) => {{
-                    tile::<S, { $n }>(s, a, panel, start, out, columns);
-                    $n
-                }};
-            }
-            r += match rows - r {
-                WIDE_TILE.. if S::WIDE => tile!(WIDE_TILE),
-                TILE.. => tile!(TILE),
-                _ => tile!(1),
-            };
+            r += s.rows(rows - r, Tile { a, panel, start, out: &mut out[r * columns + i * LANES..], columns });
         }
     }
 }
 
-/// `R` rows of one panel of [`product`]; `out` starts at the first row's first column.
-#[inline(always)]
-fn tile<S: Simd, const R: usize>(
-    s: S,
-    a: Rows<'_>,
-    panel: &[[f32; LANES]],
-    start: S::V,
-    out: &mut [f32],
+/// Some rows of one panel of [`product`]; `out` starts at the first row's first column.
+struct Tile<'a, V> {
+    a: Rows<'a>,
+    panel: &'a [[f32; LANES]],
+    start: V,
+    out: &'a mut [f32],
     columns: usize,
-) {
-    let rows: [&[f32]; R] = std::array::from_fn(|r| &a.values[r * a.stride..][..panel.len()]);
-    let mut sums = [start; R];
-    for (k, w) in panel.iter().enumerate() {
-        let w = s.load(w);
-        for (sum, row) in sums.iter_mut().zip(rows) {
-            *sum = s.mul_add(s.splat(row[k]), w, *sum);
+}
+
+impl<S: Simd> TileRows<S> for Tile<'_, S::V> {
+    #[inline(always)]
+    fn run<const N: usize>(self, s: S) {
+        let rows: [&[f32]; N] = core::array::from_fn(|r| &self.a.values[r * self.a.stride..][..self.panel.len()]);
+        let mut sums = [self.start; N];
+        for (k, w) in self.panel.iter().enumerate() {
+            let w = s.load(w);
+            for (sum, row) in sums.iter_mut().zip(rows) {
+                *sum = s.mul_add(s.splat(row[k]), w, *sum);
+            }
         }
-    }
-    for (r, sum) in sums.into_iter().enumerate() {
-        s.store(lanes_mut(&mut out[r * columns..]), sum);
+        for (r, sum) in sums.into_iter().enumerate() {
+            s.store(lanes_mut(&mut self.out[r * self.columns..]), sum);
+        }
     }
 }

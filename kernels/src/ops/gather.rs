@@ -12,7 +12,7 @@
 
 use crate::isa::Isa;
 use crate::simd::{Kernel, LANES, Simd, dispatch, relu};
-use std::ops::Range;
+use core::ops::Range;
 
 /// Vectors summed at once: 64 channels, eight AVX2 registers.
 const VECTORS: usize = 4;
@@ -56,7 +56,7 @@ impl<'a> Iterator for Kept<'a> {
     #[inline]
     fn next(&mut self) -> Option<&'a [u32]> {
         let Some(Mask { pixels, masked }) = self.mask else {
-            let all = std::mem::take(&mut self.rest);
+            let all = core::mem::take(&mut self.rest);
             return (!all.is_empty()).then_some(all);
         };
         while let Some(&first) = self.rest.first() {

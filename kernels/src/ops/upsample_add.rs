@@ -8,7 +8,7 @@
 
 use crate::isa::Isa;
 use crate::simd::{Kernel, LANES, Simd, dispatch};
-use std::ops::Range;
+use core::ops::Range;
 
 /// The arguments of an addition of an enlarged image.
 #[derive(Clone, Copy, Debug)]

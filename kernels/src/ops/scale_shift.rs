@@ -10,6 +10,8 @@
 //! The body does sixteen channels at a time.
 
 use crate::isa::Isa;
+#[cfg(not(feature = "std"))]
+use crate::math::Float as _;
 use crate::simd::{Kernel, LANES, Simd, dispatch, relu};
 
 /// The arguments of a scaling.

@@ -12,7 +12,7 @@
 
 use crate::isa::Isa;
 use crate::simd::{Kernel, LANES, Simd, dispatch};
-use std::ops::Range;
+use core::ops::Range;
 
 /// A max pooling's arguments.
 #[derive(Clone, Copy, Debug)]

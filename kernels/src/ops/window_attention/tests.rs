@@ -24,9 +24,9 @@ struct Case {
 /// Packs `[depth, columns]`; the zero columns become NaN, which must not show.
 fn pack(depth: usize, columns: usize, w: &[f32]) -> Vec<f32> {
     let mut out = vec![0.0; packed_len(depth, columns)];
-    crate::panels::pack(depth, columns, |k, n| w[k * columns + n], &mut out);
+    crate::matmul::layout::pack(depth, columns, |k, n| w[k * columns + n], &mut out);
     for (n, k) in (columns..columns.next_multiple_of(LANES)).flat_map(|n| (0..depth).map(move |k| (n, k))) {
-        out[crate::panels::packed_index(depth, k, n)] = f32::NAN;
+        out[crate::matmul::layout::packed_index(depth, k, n)] = f32::NAN;
     }
     out
 }

@@ -8,17 +8,14 @@
 //! Stride 1, zero padding k/2, so the output has the shape of the input. The sum is one chain of fused multiply-adds
 //! that starts at the bias; taps outside count as in = 0 and stay in the chain; the residual joins last.
 //!
-//! The body runs sixteen channels at a time and, where no tap leaves the row, four or eight neighbouring columns, which
-//! share each load of weights. Neither touches the order of a chain.
+//! The body runs sixteen channels at a time and, where no tap leaves the row, as many neighbouring columns as a register
+//! tile has rows, which share each load of weights. Neither touches the order of a chain.
 
 use crate::isa::Isa;
-use crate::simd::{Kernel, LANES, Simd, dispatch};
-use std::ops::Range;
-
-/// Columns that are computed together: 8 accumulators of 8 lanes leave registers for weights and inputs.
-const BLOCK: usize = 4;
-/// The same with 32 registers: as many accumulators, of 16 lanes.
-const WIDE_BLOCK: usize = 8;
+#[cfg(not(feature = "std"))]
+use crate::math::Float as _;
+use crate::simd::{Kernel, LANES, Simd, TileRows, dispatch};
+use core::ops::Range;
 
 /// A depthwise convolution's arguments.
 #[derive(Clone, Copy, Debug)]
@@ -104,21 +101,32 @@ impl Kernel for Run<'_> {
         for (y, out) in self.rows.zip(self.out.chunks_exact_mut(a.width * a.channels)) {
             let mut x = 0;
             while x < a.width {
-                let pixels = &mut out[x * a.channels..];
                 // Columns from here on, no tap of which leaves the row.
                 let inside = if x >= half { a.width.saturating_sub(x + half) } else { 0 };
-                macro_rules! columns {
-                    ($n:expr) => {{
-                        a.columns::<S, { $n }>(s, y, x, &mut pixels[..$n * a.channels]);
-                        $n
-                    }};
-                }
-                x += match inside {
-                    WIDE_BLOCK.. if S::WIDE => columns!(WIDE_BLOCK),
-                    BLOCK.. => columns!(BLOCK),
-                    _ => columns!(1),
-                };
+                x += s.rows(inside.max(1), Columns { args: a, y, x, out: &mut out[x * a.channels..] });
             }
+        }
+    }
+}
+
+/// All channels of some columns from `x` on in row `y`. If they are more than one, no tap may leave the row.
+struct Columns<'a> {
+    args: &'a Depthwise<'a>,
+    y: usize,
+    x: usize,
+    out: &'a mut [f32],
+}
+
+impl<S: Simd> TileRows<S> for Columns<'_> {
+    #[inline(always)]
+    fn run<const N: usize>(self, s: S) {
+        let Self { args, y, x, out } = self;
+        let whole = args.channels / LANES * LANES;
+        for c in (0..whole).step_by(LANES) {
+            args.tile::<S, N, true>(s, [y, x, c], out);
+        }
+        if whole < args.channels {
+            args.tile::<S, N, false>(s, [y, x, whole], out);
         }
     }
 }
@@ -131,19 +139,7 @@ impl Depthwise<'_> {
         (y < self.height && x < self.width).then(|| (y * self.width + x) * self.channels)
     }
 
-    /// All channels of the `N` columns from `x` on in row `y`. For N > 1 no tap may leave the row.
-    #[inline(always)]
-    fn columns<S: Simd, const N: usize>(&self, s: S, y: usize, x: usize, out: &mut [f32]) {
-        let whole = self.channels / LANES * LANES;
-        for c in (0..whole).step_by(LANES) {
-            self.tile::<S, N, true>(s, [y, x, c], out);
-        }
-        if whole < self.channels {
-            self.tile::<S, N, false>(s, [y, x, whole], out);
-        }
-    }
-
-    /// Up to 16 channels of [`Self::columns`], from `c` on; all 16 if `WHOLE`, which spares the accumulators the call
+    /// Up to 16 channels of [`Columns`], from `c` on; all 16 if `WHOLE`, which spares the accumulators the call
     /// that a part of a vector takes.
     #[inline(always)]
     fn tile<S: Simd, const N: usize, const WHOLE: bool>(&self, s: S, [y, x, c]: [usize; 3], out: &mut [f32]) {

@@ -1,10 +1,14 @@
-use super::*;
+use super::driver::{DEPTH, Source};
+use super::product::{Product, Rows, SCRATCH};
+use crate::isa::Isa;
+use crate::simd::Simd;
 use crate::testing::{
     Fill, JOINS, Joins, Owned, Rng, Tally, assert_close, assert_lively, assert_order_shows, assert_same_bits,
     reverse_channels, reverse_columns, round_to, write_rows,
 };
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
+use std::ops::Range;
 
 /// The plainest left matrix: one that exists. It lies in memory if `stored`, and is copied piece by piece if not.
 struct Case {
@@ -16,6 +20,7 @@ struct Case {
 }
 
 impl Source for Case {
+    type Element = f32;
     type At = usize;
     type Part = usize;
 

@@ -9,10 +9,10 @@
 //! that comes first.
 
 use crate::isa::Isa;
-use crate::panels::Panels;
-use crate::product::{Linear, Product, ROWS, Residual, SCRATCH, Source, product};
+use crate::matmul::driver::{Linear, Source};
+use crate::matmul::{BLOCK_ROWS, Panels, Product, Residual, SCRATCH};
 use crate::simd::{Kernel, Simd, dispatch};
-use std::ops::Range;
+use core::ops::Range;
 
 /// The head's arguments.
 #[derive(Clone, Copy, Debug)]
@@ -31,7 +31,7 @@ pub struct Head<'a> {
 
 /// f32 of scratch that one call needs.
 pub const fn scratch_len(channels: usize, classes: usize) -> usize {
-    SCRATCH + ROWS * (2 * channels + classes)
+    SCRATCH + BLOCK_ROWS * (2 * channels + classes)
 }
 
 /// Classifies the voxels `rows` into `classes_out`, one byte each; `logits_out`, if given, takes their logits.
@@ -82,6 +82,7 @@ struct Rows<'a> {
 }
 
 impl Source for Rows<'_> {
+    type Element = f32;
     type At = usize;
     type Part = usize;
 
@@ -134,11 +135,11 @@ impl Run<'_> {
     fn blocks(mut self, mut block: impl FnMut(usize, usize, [&mut [f32]; 4])) {
         let Head { channels, classes, .. } = *self.args;
         let (product, rest) = self.scratch.split_at_mut(SCRATCH);
-        let (a, rest) = rest.split_at_mut(ROWS * channels);
-        let (b, rest) = rest.split_at_mut(ROWS * channels);
-        let logits = &mut rest[..ROWS * classes];
-        for first in self.rows.clone().step_by(ROWS) {
-            let count = ROWS.min(self.rows.end - first);
+        let (a, rest) = rest.split_at_mut(BLOCK_ROWS * channels);
+        let (b, rest) = rest.split_at_mut(BLOCK_ROWS * channels);
+        let logits = &mut rest[..BLOCK_ROWS * classes];
+        for first in self.rows.clone().step_by(BLOCK_ROWS) {
+            let count = BLOCK_ROWS.min(self.rows.end - first);
             block(first, count, [a, b, logits, product]);
             let at = first - self.rows.start;
             let logits = &logits[..count * classes];
@@ -190,7 +191,7 @@ impl Kernel for Run<'_> {
                     let (data, to) = between(layer, input, a, b, logits);
                     let p = args.layer(layer);
                     let (source, target) = (Rows { data, stride: p.depth }, Linear { first: 0, stride: p.columns });
-                    product(s, &p, &source, &target, 0..count, to, scratch);
+                    p.compute(s, &source, &target, 0..count, to, scratch);
                 }
             },
         );
