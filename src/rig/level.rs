@@ -9,7 +9,8 @@ pub(super) struct LevelGrid {
     pub(super) grid: [usize; 3],
     /// Sample points per voxel and axis.
     pub(super) samples: usize,
-    /// Sample coordinates along x, y and z; z padded with NaN to a multiple of [`LANES`].
+    /// Sample coordinates along x, y and z; z padded to a multiple of [`LANES`], which the kernel takes at once, with NaN,
+    /// which hits nothing.
     pub(super) axes: [Vec<f32>; 3],
     /// Smallest and largest z coordinate.
     pub(super) z_range: [f64; 2],

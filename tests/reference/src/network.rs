@@ -1,7 +1,7 @@
 //! A whole network: the operations of [`Graph::build`], unrewritten, one after the other, with the checkpoint's weights.
 
 use crate::gpu::{Buffer, Gpu};
-use crate::ops::{self, HeadWeights, Matrix, Norm, Tensor, Walk};
+use crate::ops::{self, HeadWeights, Matrix, Norm, Tensor};
 use crate::{Failure, projection};
 use safetensors::Dtype;
 use std::collections::BTreeMap;
