@@ -148,23 +148,12 @@ where
     fn rows<const N: usize, const WHOLE: bool>(self, s: S) {
         let Self { block, epilogue, panels, column, first, offsets, out, .. } = self;
         let offsets: &[usize; N] = offsets[first..].first_chunk().expect("the block has these rows");
-        let place =
-            |r: usize, j: usize| Place { column: column + j * LANES, row: block.row + first + r, target: block.target };
-        let range = |r: usize, j: usize| {
-            let column = column + j * LANES;
-            let start = offsets[r] + column;
-            start..start + if WHOLE { LANES } else { LANES.min(block.columns - column) }
+        let place = Place { column, columns: block.columns, row: block.row + first, target: block.target, offsets };
+        let mut sums = if block.first {
+            epilogue.start::<T, N, P, WHOLE>(s, &place, out)
+        } else {
+            epilogue.resume::<T, N, P, WHOLE>(s, &place, out)
         };
-        let mut sums: [[A::Sums; P]; N] = core::array::from_fn(|r| {
-            core::array::from_fn(|j| {
-                let (place, out) = (place(r, j), &out[range(r, j)]);
-                if block.first {
-                    epilogue.start::<T, WHOLE>(s, &place, out)
-                } else {
-                    epilogue.resume::<T, WHOLE>(s, &place, out)
-                }
-            })
-        });
         let mut k = 0;
         for piece in 0..block.left.pieces() {
             let len = block.left.len(piece);
@@ -174,15 +163,10 @@ where
             sums = unsafe { A::multiply(s, left, panels, len, sums) };
             k += len;
         }
-        for r in 0..N {
-            for j in 0..P {
-                let (place, out) = (place(r, j), &mut out[range(r, j)]);
-                if block.last {
-                    epilogue.finish::<T, WHOLE>(s, &place, sums[r][j], out);
-                } else {
-                    epilogue.pause::<T, WHOLE>(s, &place, sums[r][j], out);
-                }
-            }
+        if block.last {
+            epilogue.finish::<T, N, P, WHOLE>(s, &place, sums, out);
+        } else {
+            epilogue.pause::<T, N, P, WHOLE>(s, &place, sums, out);
         }
     }
 }
