@@ -103,7 +103,7 @@ pub enum Residual<'a> {
         /// Distance between its rows.
         stride: usize,
     },
-    /// Added after the rectifier.
+    /// Added after ReLU.
     After {
         /// The tensor, from its first row on.
         rows: &'a [f32],

@@ -95,8 +95,8 @@ pub(crate) struct Block<'a, L, T> {
     pub(crate) last: bool,
 }
 
-/// Some rows of `P` panels.
-pub(crate) struct Tile<'a, A, S, L, T, E, const P: usize>
+/// Some rows of `P` panels. `WHOLE` says that all columns exist; else only the last panel lacks some.
+pub(crate) struct Tile<'a, A, S, L, T, E, const P: usize, const WHOLE: bool>
 where
     S: Simd,
     A: Arithmetic<S>,
@@ -116,7 +116,7 @@ where
     pub(crate) out: &'a mut [E::Out],
 }
 
-impl<A, S, L, T, E, const P: usize> TileRows<S> for Tile<'_, A, S, L, T, E, P>
+impl<A, S, L, T, E, const P: usize, const WHOLE: bool> TileRows<S> for Tile<'_, A, S, L, T, E, P, WHOLE>
 where
     S: Simd,
     A: Arithmetic<S>,
@@ -126,26 +126,6 @@ where
 {
     #[inline(always)]
     fn run<const N: usize>(self, s: S) {
-        // A mask that lets everything pass costs nothing, so where there are masks whole columns need no code of their own.
-        if S::MASKED || self.block.columns - self.column < P * LANES {
-            self.rows::<N, false>(s);
-        } else {
-            self.rows::<N, true>(s);
-        }
-    }
-}
-
-impl<A, S, L, T, E, const P: usize> Tile<'_, A, S, L, T, E, P>
-where
-    S: Simd,
-    A: Arithmetic<S>,
-    L: Left<A::Left>,
-    T: Target,
-    E: Epilogue<S, A>,
-{
-    /// `WHOLE` says that all columns exist; else only the last panel lacks some.
-    #[inline(always)]
-    fn rows<const N: usize, const WHOLE: bool>(self, s: S) {
         let Self { block, epilogue, panels, column, first, offsets, out, .. } = self;
         let offsets: &[usize; N] = offsets[first..].first_chunk().expect("the block has these rows");
         let place = Place { column, columns: block.columns, row: block.row + first, target: block.target, offsets };
