@@ -170,51 +170,150 @@ fn fill(world: &World, grid: &Grid, object: &Object, fills: &mut Vec<Fill>) {
     }
 }
 
+/// Rays that are followed together.
+const LANES: usize = 8;
+
 /// Per voxel whether a camera sees it: whether the ray of one of its pixels goes through it or ends on it.
 pub(super) fn visible(grid: &Grid, cameras: &[Pinhole], views: &[CameraView]) -> Vec<u8> {
     let mut seen = vec![0u8; grid.voxels()];
     for (camera, view) in cameras.iter().zip(views) {
         let [height, width] = camera.size;
+        let origin = grid.lidar(camera.at.as_vec3());
         // Large images need not be asked pixel by pixel.
         let stride = (width / 352).max(1);
         for v in (0..height).step_by(stride) {
+            let mut walks = Walks::new(grid, origin);
             for u in (0..width).step_by(stride) {
                 let ray = grid.lidar(camera.ray(u as f64, v as f64).as_vec3());
                 // A little farther than the surface, which may lie on the border of two voxels.
                 let depth = view.depths[v * width + u] + 0.02;
-                walk(grid, grid.lidar(camera.at.as_vec3()), ray, depth, &mut seen);
+                walks.add(ray, depth, &mut seen);
             }
+            walks.finish(&mut seen);
         }
     }
     seen
 }
 
-/// Marks the voxels that a ray passes through up to `limit` times its length.
-fn walk(grid: &Grid, origin: Vec3, ray: Vec3, limit: f32, seen: &mut [u8]) {
-    let size = Vec3::from_array(grid.size.map(|n| n as f32));
-    let (origin, ray) = ((origin - grid.low) / grid.edge, ray / grid.edge);
-    let inverse = ray.recip();
-    let Some((near, far)) = super::solid::slab(Vec3::ZERO, size, origin, inverse) else { return };
-    let far = far.min(limit);
-    if near > far {
-        return;
+/// Rays from one place on their way through a grid, lane by lane.
+struct Walks<'a> {
+    grid: &'a Grid,
+    /// In voxels, as everything here.
+    origin: Vec3,
+    count: usize,
+    far: [f32; LANES],
+    voxel: [i32; LANES],
+    axes: [Lanes; 3],
+}
+
+/// What the rays do along one axis.
+#[derive(Clone, Copy, Default)]
+struct Lanes {
+    inverse: [f32; LANES],
+    /// The border through which each ray leaves its voxel, the next one from there, and how many there are until the grid ends.
+    border: [f32; LANES],
+    step: [f32; LANES],
+    left: [i32; LANES],
+    stride: [i32; LANES],
+}
+
+impl<'a> Walks<'a> {
+    fn new(grid: &'a Grid, origin: Vec3) -> Self {
+        let origin = (origin - grid.low) / grid.edge;
+        Self { grid, origin, count: 0, far: [0.0; LANES], voxel: [0; LANES], axes: [Lanes::default(); 3] }
     }
-    let mut voxel = (origin + ray * near).floor().clamp(Vec3::ZERO, size - 1.0);
-    let step = Vec3::from_array(ray.to_array().map(|v| if v < 0.0 { -1.0 } else { 1.0 }));
-    let ahead = step.max(Vec3::ZERO);
-    loop {
-        let [x, y, z] = voxel.to_array().map(|v| v as usize);
-        seen[(x * grid.size[1] + y) * grid.size[2] + z] = 1;
-        let exits = (voxel + ahead - origin) * inverse;
-        // A ray along an axis never leaves across it.
-        let exits = exits.to_array().map(|v| if v.is_nan() { f32::INFINITY } else { v });
-        let axis = if exits[0] <= exits[1] && exits[0] <= exits[2] { 0 } else { 1 + usize::from(exits[2] < exits[1]) };
-        if exits[axis] >= far {
+
+    /// Adds a ray, which goes on for `limit` times its length, and follows all once there are enough.
+    fn add(&mut self, ray: Vec3, limit: f32, seen: &mut [u8]) {
+        let size = Vec3::from_array(self.grid.size.map(|n| n as f32));
+        let ray = ray / self.grid.edge;
+        let inverse = ray.recip();
+        let Some((near, far)) = super::solid::slab(Vec3::ZERO, size, self.origin, inverse) else { return };
+        let far = far.min(limit);
+        if near > far {
             return;
         }
-        voxel[axis] += step[axis];
-        if voxel[axis] < 0.0 || voxel[axis] >= size[axis] {
+        let start = (self.origin + ray * near).floor().clamp(Vec3::ZERO, size - 1.0);
+        let lane = self.count;
+        self.far[lane] = far;
+        self.voxel[lane] = 0;
+        let mut stride = self.grid.voxels() as i32;
+        for (axis, lanes) in self.axes.iter_mut().enumerate() {
+            let back = ray[axis] < 0.0;
+            let (here, count) = (start[axis] as i32, self.grid.size[axis] as i32);
+            stride /= count;
+            self.voxel[lane] += here * stride;
+            lanes.inverse[lane] = inverse[axis];
+            lanes.border[lane] = start[axis] + if back { 0.0 } else { 1.0 };
+            lanes.step[lane] = if back { -1.0 } else { 1.0 };
+            lanes.left[lane] = if back { here } else { count - 1 - here };
+            lanes.stride[lane] = if back { -stride } else { stride };
+        }
+        self.count += 1;
+        if self.count == LANES {
+            self.finish(seen);
+        }
+    }
+
+    /// Marks the voxels that the rays pass through, and forgets the rays.
+    fn finish(&mut self, seen: &mut [u8]) {
+        if self.count == 0 {
             return;
+        }
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            #[target_feature(enable = "avx2")]
+            fn wide(walks: &mut Walks, seen: &mut [u8]) {
+                walks.follow(seen);
+            }
+            // SAFETY: the processor has AVX2.
+            return unsafe { wide(self, seen) };
+        }
+        self.follow(seen);
+    }
+
+    /// What `finish` does, compiled for the instructions of its caller; there is no sum whose order they could change.
+    #[inline(always)]
+    fn follow(&mut self, seen: &mut [u8]) {
+        // Lanes without a ray stay at a voxel that is marked anyway.
+        for lane in self.count..LANES {
+            (self.voxel[lane], self.far[lane]) = (self.voxel[0], f32::NEG_INFINITY);
+        }
+        self.count = 0;
+        let origin = self.origin.to_array();
+        loop {
+            self.voxel.iter().for_each(|&voxel| seen[voxel as usize] = 1);
+            let mut on = 0;
+            for lane in 0..LANES {
+                let exit = |axis: usize| {
+                    let lanes = &self.axes[axis];
+                    let distance = (lanes.border[lane] - origin[axis]) * lanes.inverse[lane];
+                    // A ray along a border never leaves across it.
+                    if distance.is_nan() { f32::INFINITY } else { distance }
+                };
+                let (x, y, z) = (exit(0), exit(1), exit(2));
+                let first = x <= y && x <= z;
+                let third = !first && z < y;
+                let along = [first, !first && !third, third];
+                let exit = if first {
+                    x
+                } else if third {
+                    z
+                } else {
+                    y
+                };
+                let before_end = exit < self.far[lane];
+                for (lanes, along) in self.axes.iter_mut().zip(along) {
+                    let goes = i32::from(before_end && along && lanes.left[lane] != 0);
+                    lanes.border[lane] += lanes.step[lane] * goes as f32;
+                    lanes.left[lane] -= goes;
+                    self.voxel[lane] += lanes.stride[lane] * goes;
+                    on |= goes;
+                }
+            }
+            if on == 0 {
+                return;
+            }
         }
     }
 }

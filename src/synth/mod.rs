@@ -11,6 +11,7 @@ mod camera;
 mod labels;
 mod objects;
 mod render;
+mod sight;
 mod solid;
 mod street;
 mod texture;
@@ -129,8 +130,9 @@ impl Synthesiser {
         let world = World::new(seed, metres(count.saturating_sub(1)), metres(index));
         let light = Light::new(&mut Random::new(seed ^ 0x11f4_7e57_ab1e_0001));
         let noise = |camera: usize| seed.wrapping_mul(0x9e37_79b9) ^ (index as u64) << 32 ^ camera as u64;
-        let views: Vec<CameraView> =
-            self.cameras.iter().enumerate().map(|(n, camera)| world.view(&light, camera, noise(n))).collect();
+        let shadows = world.shadows(&light);
+        let view = |(n, camera)| world.view(&light, shadows.as_ref(), camera, noise(n));
+        let views: Vec<CameraView> = self.cameras.iter().enumerate().map(view).collect();
         let grid = Grid::new(&self.network, self.forward);
         let labels = labels::voxels(&world, &grid);
         let visible = labels::visible(&grid, &self.cameras, &views);

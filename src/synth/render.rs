@@ -1,6 +1,7 @@
 //! What a camera sees of a world: colours, and per pixel the class and the distance.
 
 use super::camera::Pinhole;
+use super::sight::{Shadows, Sight};
 use super::solid::Part;
 use super::street::class;
 use super::texture::{pick, smooth};
@@ -110,8 +111,13 @@ impl Light {
         let blue = blue + self.direct * (0.3 * glow * glow);
         // A layer of clouds overhead, seen flat towards the horizon.
         let at = ray.truncate() / (up + 0.12) * 1.6;
-        let cloud = 0.65 * smooth(at.x, at.y, self.salt) + 0.35 * smooth(at.x * 2.7, at.y * 2.7, self.salt ^ 1);
-        let cover = ((cloud - 1.0 + self.clouds) * 4.0).clamp(0.0, 1.0);
+        let cover = |cloud: f32| ((cloud - 1.0 + self.clouds) * 4.0).clamp(0.0, 1.0);
+        let coarse = 0.65 * smooth(at.x, at.y, self.salt);
+        // Where the fine pattern, from 0 to 0.35, decides nothing, it is not asked; with some room for rounding.
+        let (least, most) = (cover(coarse - 1e-3), cover(coarse + 0.351));
+        let open = least != most;
+        let fine = if open { 0.35 * smooth(at.x * 2.7, at.y * 2.7, self.salt ^ 1) } else { 0.0 };
+        let cover = if open { cover(coarse + fine) } else { most };
         blue.lerp(self.ambient * 1.25, cover * 0.85)
     }
 }
@@ -128,9 +134,10 @@ impl World {
         self.ego.0 + Vec3::Z * LIDAR_HEIGHT + self.turned(v)
     }
 
-    fn sample(&self, light: &Light, origin: Vec3, ray: Vec3) -> Sample {
+    fn sample(&self, light: &Light, shadows: Option<&Shadows>, sight: &mut Sight, ray: Vec3) -> Sample {
+        let origin = sight.origin();
         let ground = self.street.hit(origin, ray, HORIZON);
-        let object = self.hit(origin, ray, ground.unwrap_or(HORIZON));
+        let object = sight.hit(ray, ground.unwrap_or(HORIZON));
         let (distance, normal, base, class, surface) = match (object, ground) {
             (Some((number, part, hit)), _) => {
                 let object = &self.objects[number];
@@ -154,7 +161,7 @@ impl World {
         };
         let at = origin + ray * distance + normal * (2e-3 * (1.0 + distance * 0.1));
         let facing = normal.dot(light.sun).max(0.0);
-        let lit = facing > 0.0 && light.direct.x > 0.02 && !self.shaded(at, light.sun, SHADOW);
+        let lit = facing > 0.0 && shadows.is_some_and(|shadows| !shadows.at(at));
         let sun = if lit { facing } else { 0.0 };
         let colour = base * (light.ambient * (0.8 + 0.2 * normal.z) + light.direct * sun);
         let haze = distance * distance / (distance * distance + light.haze * light.haze);
@@ -162,39 +169,47 @@ impl World {
         Sample { colour, class, distance, surface }
     }
 
+    /// What keeps the sun from where; none on a day without sun.
+    pub(super) fn shadows(&self, light: &Light) -> Option<Shadows<'_>> {
+        (light.direct.x > 0.02).then(|| Shadows::new(self, light.sun, SHADOW))
+    }
+
     /// What a camera sees. `seed` is of the sensor's noise.
-    pub(super) fn view(&self, light: &Light, camera: &Pinhole, seed: u64) -> CameraView {
+    pub(super) fn view(&self, light: &Light, shadows: Option<&Shadows>, camera: &Pinhole, seed: u64) -> CameraView {
         let [height, width] = camera.size;
-        let origin = self.placed(camera.at.as_vec3());
-        let cast = |u: f64, v: f64| {
+        let cast = |sight: &mut Sight, u: f64, v: f64| {
             let ray = self.turned(camera.ray(u, v).as_vec3());
             let length = ray.length();
-            (self.sample(light, origin, ray / length), length)
+            (self.sample(light, shadows, sight, ray / length), length)
         };
-        let mut samples = Vec::with_capacity(height * width);
+        let mut sight = Sight::new(self, camera);
         let (mut classes, mut depths) = (vec![SKY; height * width], vec![f32::INFINITY; height * width]);
-        for pixel in 0..height * width {
-            let (sample, length) = cast((pixel % width) as f64, (pixel / width) as f64);
+        let (mut surfaces, mut colours) = (vec![0u32; height * width], vec![Vec3::ZERO; height * width]);
+        sight.pixels(|sight, u, v| {
+            let (sample, length) = cast(sight, u as f64, v as f64);
+            let pixel = v * width + u;
             (classes[pixel], depths[pixel]) = (sample.class, sample.distance / length);
-            samples.push(sample);
+            (surfaces[pixel], colours[pixel]) = (sample.surface, sample.colour);
+        });
+        if width <= SMALL {
+            sight.pixels(|sight, u, v| {
+                let pixel = v * width + u;
+                let other = |near: bool, at: usize| near && surfaces[at] != surfaces[pixel];
+                let edge = other(u > 0, pixel.wrapping_sub(1))
+                    || other(u + 1 < width, pixel + 1)
+                    || other(v > 0, pixel.wrapping_sub(width))
+                    || other(v + 1 < height, pixel + width);
+                if edge {
+                    for (du, dv) in [(0.33, 0.12), (-0.12, 0.33), (-0.33, -0.12), (0.12, -0.33)] {
+                        colours[pixel] += cast(sight, u as f64 + du, v as f64 + dv).0.colour;
+                    }
+                    colours[pixel] *= 0.2;
+                }
+            });
         }
         let mut random = Random::new(seed);
         let mut bgr = vec![0u8; height * width * 3];
-        for pixel in 0..height * width {
-            let (u, v) = (pixel % width, pixel / width);
-            let here = samples[pixel].surface;
-            let other = |near: bool, at: usize| near && samples[at].surface != here;
-            let edge = other(u > 0, pixel.wrapping_sub(1))
-                || other(u + 1 < width, pixel + 1)
-                || other(v > 0, pixel.wrapping_sub(width))
-                || other(v + 1 < height, pixel + width);
-            let mut colour = samples[pixel].colour;
-            if edge && width <= SMALL {
-                for (du, dv) in [(0.33, 0.12), (-0.12, 0.33), (-0.33, -0.12), (0.12, -0.33)] {
-                    colour += cast(u as f64 + du, v as f64 + dv).0.colour;
-                }
-                colour *= 0.2;
-            }
+        for (pixel, &colour) in colours.iter().enumerate() {
             let grain = Vec3::new(random.normal(), random.normal(), random.normal()) * light.noise;
             // A camera's curve: shadows are lifted, lights compressed.
             let exposed = (colour * light.exposure).max(Vec3::ZERO);

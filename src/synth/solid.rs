@@ -32,8 +32,9 @@ pub(super) struct Object {
     /// Its x axis in the world: a unit vector.
     pub(super) along: Vec2,
     pub(super) parts: Vec<Part>,
-    low: Vec3,
-    high: Vec3,
+    /// Common bounds of the parts.
+    pub(super) low: Vec3,
+    pub(super) high: Vec3,
 }
 
 /// Where a ray meets a part.
@@ -72,28 +73,47 @@ impl Object {
         [middle - reach, middle + reach]
     }
 
-    /// The nearest part that a ray of the world meets before `limit`, and where.
-    pub(super) fn hit(&self, origin: Vec3, ray: Vec3, limit: f32) -> Option<(usize, Hit)> {
+    /// The nearest of some parts, in ascending order, that a ray of the world meets before `limit`, and where.
+    pub(super) fn hit(
+        &self,
+        origin: Vec3,
+        ray: Vec3,
+        limit: f32,
+        parts: impl Iterator<Item = usize>,
+    ) -> Option<(usize, Hit)> {
         let (origin, ray) = (self.inwards(origin - self.at), self.inwards(ray));
         let inverse = ray.recip();
         slab(self.low, self.high, origin, inverse).filter(|&(near, _)| near < limit)?;
         let mut best: Option<(usize, Hit)> = None;
-        for (index, part) in self.parts.iter().enumerate() {
+        for index in parts {
             let limit = best.map_or(limit, |(_, hit)| hit.distance);
-            if let Some(hit) = part.hit(origin, ray, inverse).filter(|hit| hit.distance < limit) {
+            if let Some(hit) = self.parts[index].hit(origin, ray, inverse).filter(|hit| hit.distance < limit) {
                 best = Some((index, hit));
             }
         }
         best.map(|(index, hit)| (index, Hit { normal: self.outwards(hit.normal), ..hit }))
     }
 
-    /// Whether any part lies in the ray's way before `limit`.
-    pub(super) fn shades(&self, origin: Vec3, ray: Vec3, limit: f32) -> bool {
-        let (origin, ray) = (self.inwards(origin - self.at), self.inwards(ray));
-        let inverse = ray.recip();
-        slab(self.low, self.high, origin, inverse).is_some_and(|(near, _)| near < limit)
-            && self.parts.iter().any(|p| p.hit(origin, ray, inverse).is_some_and(|hit| hit.distance < limit))
+    /// Whether any of some parts lies in a ray's way before `limit`. The place is the world's; the ray and its reciprocal
+    /// are in the object's coordinates.
+    pub(super) fn shades(
+        &self,
+        place: Vec3,
+        [ray, inverse]: [Vec3; 2],
+        limit: f32,
+        mut parts: impl Iterator<Item = usize>,
+    ) -> bool {
+        let origin = self.inwards(place - self.at);
+        parts.any(|part| self.parts[part].hit(origin, ray, inverse).is_some_and(|hit| hit.distance < limit))
+            && slab(self.low, self.high, origin, inverse).is_some_and(|(near, _)| near < limit)
     }
+}
+
+/// Middle and half lengths, along three directions of the world, of a box in an object's coordinates.
+pub(super) fn outline(object: &Object, centre: Vec3, half: Vec3, directions: [Vec3; 3]) -> (Vec3, Vec3) {
+    let middle = object.at + object.outwards(centre);
+    let inwards = directions.map(|d| object.inwards(d).abs().dot(half));
+    (Vec3::from_array(directions.map(|d| d.dot(middle))), Vec3::from_array(inwards))
 }
 
 impl Part {

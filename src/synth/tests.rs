@@ -168,7 +168,7 @@ fn rays_and_points_agree_on_every_shape() {
             );
             let from = target + Vec3::new(random.range(-1.0, 1.0), random.range(-1.0, 1.0), 0.5).normalize() * 40.0;
             let ray = (target - from).normalize();
-            let found = object.hit(from, ray, 100.0);
+            let found = object.hit(from, ray, 100.0, 0..object.parts.len());
             let inside = |distance: f32, thick: f32| {
                 let at = object.inwards(from + ray * distance - object.at);
                 object.parts.iter().any(|p| p.contains(at, thick))
@@ -178,7 +178,9 @@ fn rays_and_points_agree_on_every_shape() {
                 // A ray that only grazes a part is out of it again at once.
                 deep += usize::from([1e-3, 4e-3, 1e-2].into_iter().any(|step| inside(hit.distance + step, 0.02)));
                 assert!(hit.normal.dot(ray) < 1e-3 && (hit.normal.length() - 1.0).abs() < 1e-3);
-                assert!(object.shades(from, ray, 100.0) && !object.shades(from, ray, hit.distance - 0.01));
+                let inner = object.inwards(ray);
+                let shades = |limit| object.shades(from, [inner, inner.recip()], limit, 0..object.parts.len());
+                assert!(shades(100.0) && !shades(hit.distance - 0.01));
             }
             let aim = (target - from).length();
             let point = object.inwards(target - object.at);

@@ -74,7 +74,11 @@ pub(super) fn fraction(x: f32) -> f32 {
 
 /// A number in [0, 1) that depends on two integers and `salt`.
 pub(super) fn speckle(a: f32, b: f32, salt: u32) -> f32 {
-    let mut h = (a as i32 as u32).wrapping_mul(0x9e37_79b1) ^ (b as i32 as u32).wrapping_mul(0x85eb_ca77) ^ salt;
+    speckle_of(a as i32 as u32, b as i32 as u32, salt)
+}
+
+fn speckle_of(a: u32, b: u32, salt: u32) -> f32 {
+    let mut h = a.wrapping_mul(0x9e37_79b1) ^ b.wrapping_mul(0x85eb_ca77) ^ salt;
     h = (h ^ h >> 15).wrapping_mul(0x2c1b_3c6d);
     h = (h ^ h >> 12).wrapping_mul(0x297a_2d39);
     ((h ^ h >> 15) >> 8) as f32 * (1.0 / (1u32 << 24) as f32)
@@ -91,8 +95,9 @@ pub(super) fn smooth(x: f32, y: f32, salt: u32) -> f32 {
     let (i, j) = (x.floor(), y.floor());
     let ease = |t: f32| t * t * (3.0 - 2.0 * t);
     let (u, v) = (ease(x - i), ease(y - j));
-    let row = |j: f32| speckle(i, j, salt) * (1.0 - u) + speckle(i + 1.0, j, salt) * u;
-    row(j) * (1.0 - v) + row(j + 1.0) * v
+    let (i, j) = (i as i32 as u32, j as i32 as u32);
+    let row = |j: u32| speckle_of(i, j, salt) * (1.0 - u) + speckle_of(i.wrapping_add(1), j, salt) * u;
+    row(j) * (1.0 - v) + row(j.wrapping_add(1)) * v
 }
 
 /// A colour written as 0xRRGGBB.

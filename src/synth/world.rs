@@ -1,7 +1,7 @@
 //! A world of one seed at one moment: the street, and everything that stands or drives on it.
 
 use super::objects::{self, Model, class};
-use super::solid::{Hit, Object, slab};
+use super::solid::{Object, slab};
 use super::street::{LANE, PARKING, Street, Use};
 use super::texture::pick;
 use crate::base::random::Random;
@@ -20,13 +20,13 @@ const CELL: f32 = 6.0;
 pub(super) struct World {
     pub(super) street: Street,
     pub(super) objects: Vec<Object>,
-    index: Index,
+    pub(super) index: Index,
     /// Where the ego vehicle stands: a point on the ground and its direction.
     pub(super) ego: (Vec3, Vec2),
 }
 
 /// Which objects reach into which cell of a lattice.
-struct Index {
+pub(super) struct Index {
     low: Vec2,
     size: [usize; 2],
     /// For each cell the end of its objects in `objects`; the first cell's begin at 0.
@@ -65,31 +65,6 @@ impl World {
         let ego = (at.extend(street.height(at)), along);
         Self { index: Index::new(&objects), street, objects, ego }
     }
-
-    /// The nearest object that a ray meets before `limit`: its number, its part's, and where.
-    pub(super) fn hit(&self, origin: Vec3, ray: Vec3, limit: f32) -> Option<(usize, usize, Hit)> {
-        let mut best: Option<(usize, usize, Hit)> = None;
-        self.index.walk(origin, ray, limit, |cell, leaves_at| {
-            for &object in cell {
-                let limit = best.map_or(limit, |(_, _, hit)| hit.distance);
-                if let Some((part, hit)) = self.objects[object as usize].hit(origin, ray, limit) {
-                    best = Some((object as usize, part, hit));
-                }
-            }
-            best.is_none_or(|(_, _, hit)| hit.distance > leaves_at)
-        });
-        best
-    }
-
-    /// Whether an object lies in a ray's way before `limit`.
-    pub(super) fn shaded(&self, origin: Vec3, ray: Vec3, limit: f32) -> bool {
-        let mut shaded = false;
-        self.index.walk(origin, ray, limit, |cell, _| {
-            shaded = cell.iter().any(|&object| self.objects[object as usize].shades(origin, ray, limit));
-            !shaded
-        });
-        shaded
-    }
 }
 
 impl Index {
@@ -121,33 +96,35 @@ impl Index {
 
     /// Calls `visit` with the objects of each cell on a ray's way before `limit`, nearest first, and the distance at
     /// which the ray leaves the cell, until it returns false.
-    fn walk(&self, origin: Vec3, ray: Vec3, limit: f32, mut visit: impl FnMut(&[u32], f32) -> bool) {
+    pub(super) fn walk(&self, origin: Vec3, ray: Vec3, limit: f32, mut visit: impl FnMut(&[u32], f32) -> bool) {
         let inverse = ray.recip();
         let Some((near, far)) = slab(self.bounds[0], self.bounds[1], origin, inverse) else { return };
         let far = far.min(limit);
         let start = (origin.truncate() + ray.truncate() * near - self.low) / CELL;
         let last = Vec2::new(self.size[0] as f32 - 1.0, self.size[1] as f32 - 1.0);
-        let mut cell = start.floor().clamp(Vec2::ZERO, last);
-        let step = Vec2::new(if ray.x < 0.0 { -1.0 } else { 1.0 }, if ray.y < 0.0 { -1.0 } else { 1.0 });
+        let mut cell = start.floor().clamp(Vec2::ZERO, last).to_array();
+        let last = last.to_array();
+        let step = [ray.x, ray.y].map(|v| if v < 0.0 { -1.0 } else { 1.0 });
         // Distance at which the ray leaves the cell along an axis.
-        let exit = |cell: Vec2, axis: usize| {
-            let edge = self.low[axis] + (cell[axis] + if step[axis] > 0.0 { 1.0 } else { 0.0 }) * CELL;
+        let exit = |cell: f32, axis: usize| {
+            let edge = self.low[axis] + (cell + if step[axis] > 0.0 { 1.0 } else { 0.0 }) * CELL;
             let distance = (edge - origin[axis]) * inverse[axis];
             if distance.is_nan() { f32::INFINITY } else { distance }
         };
+        let mut exits = [exit(cell[0], 0), exit(cell[1], 1)];
         loop {
-            let at = cell.x as usize * self.size[1] + cell.y as usize;
+            let at = cell[0] as usize * self.size[1] + cell[1] as usize;
             let from = at.checked_sub(1).map_or(0, |before| self.ends[before]);
-            let (x, y) = (exit(cell, 0), exit(cell, 1));
-            let leaves_at = x.min(y);
+            let leaves_at = exits[0].min(exits[1]);
             if !visit(&self.objects[from as usize..self.ends[at] as usize], leaves_at) || leaves_at >= far {
                 return;
             }
-            let axis = usize::from(y < x);
+            let axis = usize::from(exits[1] < exits[0]);
             cell[axis] += step[axis];
             if cell[axis] < 0.0 || cell[axis] > last[axis] {
                 return;
             }
+            exits[axis] = exit(cell[axis], axis);
         }
     }
 }

@@ -6,6 +6,7 @@ import sys
 import tempfile
 import unittest
 from pathlib import Path
+from types import SimpleNamespace
 
 import torch
 from safetensors.torch import save_file
@@ -19,14 +20,15 @@ import made_up  # noqa: E402
 
 from voxcast_train.auxiliary import PixelHeads, PlaceHeads, places  # noqa: E402
 from voxcast_train.calibrate import fit_shifts, miou_of  # noqa: E402
-from voxcast_train.config import Config  # noqa: E402
-from voxcast_train.data import DEPTH_BINS, Frames, augment, depth_bins, order  # noqa: E402
+from voxcast_train import rigs  # noqa: E402
+from voxcast_train.config import Config, Jitter  # noqa: E402
+from voxcast_train.data import CHANGES, DEPTH_BINS, Frames, augment, depth_bins, kept_cameras, order  # noqa: E402
 from voxcast_train.errors import InputError  # noqa: E402
 from voxcast_train.losses import IGNORED, level_losses, lovasz_softmax, lovasz_softmax_of_some, pooled_labels  # noqa: E402
 from voxcast_train.metrics import Confusion  # noqa: E402
 from voxcast_train.network import InverseMatrixVT3D, Network  # noqa: E402
-from voxcast_train.rig import Matrix, Rig  # noqa: E402
-from voxcast_train.train import rate  # noqa: E402
+from voxcast_train.rig import DenseMatrix, Matrix, Rig  # noqa: E402
+from voxcast_train.train import rate, rig_order  # noqa: E402
 
 
 class Place(unittest.TestCase):
@@ -95,6 +97,21 @@ class Losses(unittest.TestCase):
         total.backward()
         self.assertEqual((total.item(), logits.grad.abs().sum().item()), (0.0, 0.0))
 
+    def test_ignored_voxels_count_nowhere(self):
+        draw = torch.Generator().manual_seed(3)
+        logits, labels = torch.randn(400, 5, generator=draw, dtype=torch.float64), torch.randint(5, (400,), generator=draw)
+        weights = torch.rand(5, generator=draw, dtype=torch.float64)
+        ignored = torch.rand(400, generator=draw) < 0.3
+        marked = torch.where(ignored, IGNORED, labels)
+        for voxels in (0, 399):
+            with self.subTest(voxels):
+                ours = level_losses(logits, marked, weights, voxels)
+                plain = level_losses(logits[~ignored], labels[~ignored], weights, 0)
+                for name, value in plain.items():
+                    # Voxels that are right are left out where not all are sorted.
+                    close = 1e-9 if voxels == 0 or name != "lovasz" else 0.02
+                    self.assertAlmostEqual(ours[name].item(), value.item(), delta=close, msg=name)
+
     def test_pooled_labels(self):
         labels = torch.zeros(8, 8, 8, dtype=torch.uint8)
         labels[0, 0, 0] = 2
@@ -151,7 +168,7 @@ class Gather(unittest.TestCase):
     def test_mean_and_its_gradient(self):
         # Rows of 2, 0, 1 and 3 pixels out of 2 frames x 2 cameras x 2 x 3.
         ptr, col = torch.tensor([0, 2, 2, 3, 6]), torch.tensor([1, 7, 11, 0, 5, 7])
-        matrix = Matrix(ptr, col, 12)
+        matrix = Matrix(ptr, col, 12, 2)
         features = torch.randn(4, 5, 2, 3, requires_grad=True)
         rows = matrix.mean(features, 2)
         pixels = features.permute(0, 2, 3, 1).reshape(2, 12, 5)
@@ -163,6 +180,58 @@ class Gather(unittest.TestCase):
         (ours,) = torch.autograd.grad((rows * weights).sum(), features)
         (theirs,) = torch.autograd.grad((expected * weights).sum(), features)
         torch.testing.assert_close(ours, theirs)
+
+
+    def test_masked_cameras_are_left_out(self):
+        # Rows with pixels of camera 0, of camera 1, of both, and of none.
+        ptr, col = torch.tensor([0, 2, 3, 6, 6]), torch.tensor([1, 4, 7, 0, 5, 11])
+        matrix = Matrix(ptr, col, 12, 2)
+        dense = DenseMatrix((matrix.forward.to_dense() > 0).to(torch.bfloat16), matrix.counts, matrix.shares)
+        # Eighths, which bf16 holds exactly.
+        features = torch.randint(-16, 17, (4, 5, 2, 3)) / 8
+        pixels = features.permute(0, 2, 3, 1).reshape(2, 12, 5)
+        for kept in ([[1, 1], [1, 1]], [[0, 1], [1, 0]], [[0, 0], [1, 1]]):
+            expected = torch.zeros(2, 4, 5)
+            for frame, keep in enumerate(kept):
+                for row in range(4):
+                    mine = [int(c) for c in col[ptr[row] : ptr[row + 1]] if keep[int(c) // 6]]
+                    if mine:
+                        expected[frame, row] = pixels[frame, mine].mean(0)
+            for name, m in (("sparse", matrix), ("dense", dense)):
+                with self.subTest(name, kept=kept):
+                    torch.testing.assert_close(m.mean(features, 2, torch.tensor(kept).float()), expected)
+
+    def test_shares_of_cameras(self):
+        matrix = Matrix(torch.tensor([0, 2, 2, 5]), torch.tensor([1, 4, 0, 5, 11]), 12, 2)
+        torch.testing.assert_close(matrix.shares, torch.tensor([[1.0, 0.0], [0.0, 0.0], [2 / 3, 1 / 3]]))
+        self.assertEqual(matrix.counts.tolist(), [2, 0, 3])
+
+
+class Jittered(unittest.TestCase):
+    def test_cameras_turn_and_move_and_keep_their_lens(self):
+        ring = made_up.ring(3, 64, 96)
+        for whole in (True, False):
+            moved = rigs.jittered(ring, 2.0, 0.1, seed=4, whole=whole)
+            self.assertTrue(torch.equal(moved, rigs.jittered(ring, 2.0, 0.1, seed=4, whole=whole)))
+            self.assertFalse(torch.equal(moved, rigs.jittered(ring, 2.0, 0.1, seed=5, whole=whole)))
+            for before, after in zip(ring.double(), moved.double()):
+                # K R (K R)^T = K K^T
+                lens = [m[:3, :3] @ m[:3, :3].T for m in (before, after)]
+                torch.testing.assert_close(lens[0], lens[1], rtol=1e-5, atol=1e-2)
+                turn = torch.linalg.solve(before[:3, :3], after[:3, :3])
+                degrees = math.degrees(math.acos(min(1.0, (float(turn.trace()) - 1.0) / 2.0)))
+                places = [-torch.linalg.solve(m[:3, :3], m[:3, 3]) for m in (before, after)]
+                metres = float((places[1] - places[0]).norm())
+                if whole:
+                    self.assertAlmostEqual(degrees, 2.0, delta=0.01)
+                    self.assertAlmostEqual(metres, 0.1, delta=1e-3)
+                self.assertTrue(degrees < 2.01 and metres < 0.101, (degrees, metres))
+
+    def test_rigs_take_turns_by_their_shares(self):
+        jitter = Jitter(rigs=4, degrees=1.0, metres=0.05, share=0.4)
+        order = rig_order(SimpleNamespace(jitter=jitter))
+        self.assertEqual([order.count(rig) for rig in range(5)], [6, 1, 1, 1, 1])
+        self.assertEqual(rig_order(SimpleNamespace(jitter=None)), [0])
 
 
 class RigFiles(Place):
@@ -282,6 +351,25 @@ class Data(Place):
             pair = torch.stack((frame.flatten(), ramp[0].float().flatten()))
             self.assertGreater(torch.corrcoef(pair)[0, 1].item(), 0.8)
 
+    def test_every_change_is_none_at_no_strength(self):
+        torch.manual_seed(6)
+        images = torch.rand(2, 3, 32, 48, 3) * 255
+        for change, first, end in CHANGES:
+            with self.subTest(change.__name__):
+                self.assertLess(first, end)
+                strength = torch.tensor([0.0, 1.0]).view(2, 1, 1, 1, 1)
+                changed = change(images, strength)
+                torch.testing.assert_close(changed[0], images[0])
+                self.assertGreater((changed[1] - images[1]).abs().mean().item(), 1.0)
+
+    def test_one_camera_at_most_is_masked(self):
+        torch.manual_seed(7)
+        kept = kept_cameras(2000, 6, 0.25, "cpu")
+        lost = 6 - kept.sum(1)
+        self.assertEqual(sorted(set(lost.tolist())), [0.0, 1.0])
+        self.assertAlmostEqual(lost.mean().item(), 0.25, delta=0.04)
+        self.assertTrue(bool(((1 - kept).sum(0) > 40).all()), "every camera has its turn")
+
     def test_majority(self):
         made_up.write_set(self.place / "set", 0, 3)
         for seed in range(3):
@@ -391,6 +479,12 @@ class Configs(Place):
             ({"workers": 3}, "multiple of the 3 workers"),
             ({"after": "config.json"}, "after.*itself"),
             ({"train": {"first": 0}}, "count"),
+            ({"drawn": "never"}, "drawn"),
+            ({"drawn": "beside", "workers": 2}, "workers"),
+            ({"jitter": {"rigs": 1, "degrees": 1, "metres": 0.1, "share": 0.5}}, "jitter"),
+            ({"jitter": {"rigs": 1}, "drawn": "beside"}, "degrees"),
+            ({"minutes": 3, "workers": 2}, "minutes"),
+            ({"tail": {"nonsense": 1}}, "nonsense"),
         ):
             with self.subTest(changes), self.assertRaisesRegex(InputError, message):
                 self.config(**changes)

@@ -17,13 +17,17 @@ sys.path.insert(0, str(HERE))
 
 import made_up  # noqa: E402
 
-from voxcast_train.config import Config  # noqa: E402
+from voxcast_train.across import summary  # noqa: E402
+from voxcast_train.config import Config, Tail  # noqa: E402
 from voxcast_train.data import Frames  # noqa: E402
 from voxcast_train.errors import InputError  # noqa: E402
 from voxcast_train.evaluate import evaluate, evaluate_majority, load_model  # noqa: E402
 from voxcast_train.export import export  # noqa: E402
 from voxcast_train.network import InverseMatrixVT3D, Network, initialise  # noqa: E402
+from voxcast_train.program import Program  # noqa: E402
+from voxcast_train.reproduce import reproduce  # noqa: E402
 from voxcast_train.rig import Rig  # noqa: E402
+from voxcast_train.tail import STAGE, train_tail  # noqa: E402
 from voxcast_train.train import run  # noqa: E402
 from voxcast_train.unpack import restore_norms, unpack  # noqa: E402
 from voxcast_train.workers import Worker, run_workers  # noqa: E402
@@ -31,15 +35,19 @@ from voxcast_train.workers import Worker, run_workers  # noqa: E402
 CPU = torch.device("cpu")
 
 
+def program() -> Path:
+    """$VOXCAST, or the newest build in target/."""
+    if named := os.environ.get("VOXCAST"):
+        return Path(named)
+    built = [HERE.parents[1] / "target" / kind / "voxcast" for kind in ("release", "debug")]
+    built = [path for path in built if path.exists()]
+    assert built, "no voxcast in target/: run `cargo build --release`, or name one with VOXCAST"
+    return max(built, key=lambda path: path.stat().st_mtime)
+
+
 def voxcast(*arguments) -> str:
-    """Runs the program: $VOXCAST, or the newest build in target/."""
-    program = os.environ.get("VOXCAST")
-    if program is None:
-        built = [HERE.parents[1] / "target" / kind / "voxcast" for kind in ("release", "debug")]
-        built = [path for path in built if path.exists()]
-        assert built, "no voxcast in target/: run `cargo build --release`, or name one with VOXCAST"
-        program = max(built, key=lambda path: path.stat().st_mtime)
-    done = subprocess.run([program, *map(str, arguments)], capture_output=True, text=True)
+    """Runs the program."""
+    done = subprocess.run([program(), *map(str, arguments)], capture_output=True, text=True)
     assert done.returncode == 0, f"voxcast {arguments}: {done.stderr}"
     return done.stdout
 
@@ -235,6 +243,100 @@ class Run(unittest.TestCase):
         run(self.config("first", steps=20), work, CPU)
         with self.assertRaisesRegex(InputError, '"learning_rate": found 0.004, expected 0.02'):
             run(self.config("second", steps=20, learning_rate=2e-2), work, CPU)
+
+
+STREET = {
+    "depths": [1, 1, 1, 1], "width": 8, "dcn": [False] * 4, "block": "basic", "fpn": 16, "channels": [16, 16, 24, 32],
+    "key_dims": [2, 3, 4], "bounds": [[-27, 27], [-27, 27], [-5.3, 2.7]], "classes": 17, "image": [32, 96],
+    "grids": [[28, 28, 4], [14, 14, 2], [7, 7, 1]], "samples": [4, 5, 6], "cameras": 6,
+}  # fmt: skip
+"""A network for drawn streets, as small as it can be."""
+
+
+class FromSeeds(unittest.TestCase):
+    """Runs that draw their frames."""
+
+    def setUp(self):
+        self.place = tempfile.TemporaryDirectory()
+        self.work = Path(self.place.name)
+        (self.work / "network.json").write_text(json.dumps(STREET))
+        self.program = Program(program())
+
+    def tearDown(self):
+        self.place.cleanup()
+
+    def config(self, name: str, **changes) -> Config:
+        values = {
+            "train": {"first": 0, "count": 24},
+            "tune": {"first": 500000, "count": 2},
+            "held_out": {"first": 1000000, "count": 3},
+            "steps": 8,
+            "batch": 2,
+            "drawn": "beside",
+            "ready": 4,
+            "drawers": 2,
+            "jitter": {"rigs": 1, "degrees": 1, "metres": 0.05, "share": 0.5},
+            "masked": 0.5,
+            "lovasz_voxels": 500,
+            "log_every": 4,
+            "phases": [{"start": 0, "volumes": False}, {"start": 4}],
+        }
+        path = self.work / f"{name}.json"
+        path.write_text(json.dumps({**values, **changes}))
+        return Config.load(path)
+
+    def test_frames_are_drawn_beside_and_a_model_comes_out(self):
+        first = self.config("first")
+        tail = {"first": 20000, "count": 2, "steps": 2, "batch": 2, "lovasz_voxels": 500}
+        config = self.config("second", after="first.json", tail=tail, minutes=0.02, steps=100, phases=[{"start": 0}])
+        self.assertNotEqual(first.identity(), config.identity())
+        reports = reproduce(config, self.work / "run", self.program, CPU)
+        run_of_first = self.work / "run" / "first"
+        rows = [json.loads(line) for line in (run_of_first / "log.jsonl").read_text().splitlines()]
+        taught = [row for row in rows if row["kind"] == "train"]
+        self.assertEqual([(row["step"], "focal0" in row) for row in taught], [(4, False), (8, True)])
+        self.assertTrue(4 <= taught[-1]["frames"] <= 24)
+        # The clock ended the other one.
+        state = torch.load(self.work / "run" / "state.pt", weights_only=True)
+        self.assertGreaterEqual(state["seconds"], 1.2)
+        self.assertLess(state["step"], 100)
+        masked = [f"{how} {name}" for name in ("CAM_FRONT", "CAM_BACK") for how in ("with", "without")]
+        self.assertTrue({"plain", "jittered", "majority", *masked} <= reports.keys(), reports.keys())
+        self.assertEqual(reports["with CAM_BACK"]["all"], reports["plain"]["all"])
+        self.assertNotEqual(reports["without CAM_BACK"]["all"], reports["plain"]["all"])
+        self.assertIn("jittered", summary(reports))
+        self.assertEqual(list((run_of_first / "drawn").glob("*/*.safetensors")), [], "frames that were read are gone")
+        # The model is one of the network, and its function that of the checkpoint.
+        voxcast("selftest", self.work / "run" / "model.safetensors")
+
+    def test_the_last_stage_alone_gets_better_and_nothing_else_changes(self):
+        made_up.write_network(self.work)
+        made_up.write_set(self.work / "train", 0, 4)
+        voxcast("rig", next((self.work / "train").iterdir()), "--network", self.work / "network.json", "-o", self.work / "rig.safetensors")
+        network = Network.load(self.work / "network.json")
+        frames, rig = Frames([self.work / "train"], network, pixels=False), Rig.load(self.work / "rig.safetensors", network)
+        model = InverseMatrixVT3D(network)
+        initialise(model)
+        before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+        scores = [evaluate(model, rig, frames, CPU).report()["all"]["iou"]]
+        train_tail(model, rig, frames, Tail(steps=40, batch=2, learning_rate=1e-2, masked=0.0), CPU)
+        scores.append(evaluate(model, rig, frames, CPU).report()["all"]["iou"])
+        self.assertGreater(scores[1], scores[0] + 10.0)
+        for name, tensor in model.state_dict().items():
+            last = name.startswith(STAGE) and not name.endswith(("running_mean", "running_var", "num_batches_tracked"))
+            # A bias before a batch norm that keeps its statistics has a gradient too.
+            self.assertEqual(torch.equal(tensor, before[name]), not last, name)
+
+    def test_a_program_that_fails_is_named(self):
+        config = self.config("failing", jitter=None)
+        (self.work / "rigs" / "00").mkdir(parents=True)
+        self.program.make_set(self.work / "tune", 500000, 2, self.work / "network.json")
+        voxcast("rig", self.work / "tune" / "000500000.safetensors", "--network", self.work / "network.json", "-o",
+                self.work / "rigs" / "00" / "rig.safetensors")  # fmt: skip
+        with self.assertRaisesRegex(InputError, "drawing frames failed.*false synth"):
+            run(config, self.work, CPU, program=Program(Path("/bin/false")))
+        with self.assertRaisesRegex(InputError, "--voxcast"):
+            run(config, self.work, CPU)
 
 
 if __name__ == "__main__":

@@ -12,17 +12,16 @@ import argparse
 import sys
 
 import torch
-from safetensors.torch import load_file
 from torch import Tensor
 
 from .data import Frames
 from .errors import InputError
-from .evaluate import model_of
+from .evaluate import load_model
 from .export import export
 from .losses import IGNORED
 from .metrics import scores
 from .network import InverseMatrixVT3D, Network
-from .rig import Rig
+from .rig import Rig, Rigs
 
 BIAS = "occ_head.mlp_occ_lvl0.4.bias"
 
@@ -38,7 +37,7 @@ def miou_of(predicted: Tensor, labels: Tensor, classes: int) -> float:
 def fit_shifts(logits: Tensor, labels: Tensor) -> tuple:
     """Shifts [K] for logits [V, K] by coordinate ascent, and the mIoU in percent before and after."""
     classes = logits.shape[1]
-    shifts = torch.zeros(classes)
+    shifts = torch.zeros(classes, device=logits.device)
     before = best = miou_of(logits.argmax(1), labels, classes)
     for reach, apart in ROUNDS:
         for c in range(1, classes):
@@ -52,29 +51,32 @@ def fit_shifts(logits: Tensor, labels: Tensor) -> tuple:
                 value = miou_of(predicted, labels, classes)
                 if value > best:
                     best, shifts[c] = value, present + move
-    return shifts, before, best
+    return shifts.cpu(), before, best
 
 
 @torch.no_grad()
-def collect(model: InverseMatrixVT3D, rig: Rig, frames: Frames) -> tuple:
-    """Logits [V, K] and labels [V] of all voxels of all frames that are not ignored."""
+def collect(model: InverseMatrixVT3D, rig: Rig, frames: Frames, device: torch.device) -> tuple:
+    """Logits [V, K] and labels [V] of all voxels of all frames that are not ignored, on the device."""
+    model = model.to(device).eval()
     logits, labels = [], []
     for number in range(len(frames)):
         batch = frames.batch([number])
-        of_frame, truth = model(batch["images"], rig)[0].flatten(0, -2), batch["labels"][0].flatten().long()
+        of_frame = model(batch["images"].to(device), rig)[0].flatten(0, -2)
+        truth = batch["labels"][0].flatten().long().to(device)
         counted = truth != IGNORED
         logits.append(of_frame[counted])
         labels.append(truth[counted])
     return torch.cat(logits), torch.cat(labels)
 
 
-def calibrated(weights: dict, network: Network, rig: Rig, frames: Frames) -> dict:
-    """The weights with the shifts that suit these frames; prints what they change."""
-    logits, labels = collect(model_of(network, weights), rig, frames)
+def calibrated(model: InverseMatrixVT3D, rig: Rig, frames: Frames, device: torch.device) -> dict:
+    """A model's weights with the shifts that suit these frames; prints what they change. `rig` is on the device."""
+    logits, labels = collect(model, rig, frames, device)
     shifts, before, after = fit_shifts(logits, labels)
     print(f"mIoU of {len(frames)} frames: {before:.2f}, with shifts {after:.2f}")
     print("shifts: " + " ".join(f"{shift:+.2f}" for shift in shifts.tolist()), flush=True)
-    return {**weights, BIAS: weights[BIAS] + shifts}
+    weights = {name: tensor.cpu() for name, tensor in model.state_dict().items()}
+    return {**weights, BIAS: weights[BIAS].float() + shifts}
 
 
 def main() -> int:
@@ -85,14 +87,16 @@ def main() -> int:
     parser.add_argument("--set", required=True, action="append")
     parser.add_argument("--limit", type=int, help="the first so many frames; each takes some 6 MB")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("-o", "--output", required=True, help="the checkpoint to write")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     try:
         network = Network.load(options.network)
         frames = Frames(options.set, network, pixels=False, limit=options.limit)
-        rig = Rig.load(options.rig, network)
-        export(calibrated(load_file(options.checkpoint), network, rig, frames), options.output)
+        device = torch.device(options.device)
+        rig = Rigs([Rig.load(options.rig, network)], device).select(0)
+        export(calibrated(load_model(network, options.checkpoint), rig, frames, device), options.output)
     except (InputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -36,6 +36,31 @@ class Phase:
 
 
 @dataclass(frozen=True)
+class Jitter:
+    """Rings whose mounting is off: so many, each camera turned and moved by up to so much."""
+
+    rigs: int
+    degrees: float
+    metres: float
+    share: float
+    """Of the steps, and of the frames."""
+
+
+@dataclass(frozen=True)
+class Tail:
+    """Training of the last stage alone, after the run, on frames of its own (`tail.py`)."""
+
+    first: int = 20_000
+    count: int = 160
+    """Seeds of its frames."""
+    steps: int = 400
+    batch: int = 4
+    learning_rate: float = 1e-3
+    masked: float = 0.2
+    lovasz_voxels: int = 60_000
+
+
+@dataclass(frozen=True)
 class Config:
     """Every number that decides a run, together with the sets and the rig."""
 
@@ -43,10 +68,26 @@ class Config:
     tune: Seeds
     held_out: Seeds
     steps: int
+    """With `minutes`, what phases, warm-up and rates are counted in; as many are taken as the time allows."""
     batch: int
     network: str = "network.json"
     after: str | None = None
     """Another config, beside this one: training starts from the model that its run gave."""
+    minutes: float | None = None
+    """Time to train for: phases and rates follow the clock instead of the steps."""
+    drawn: str = "before"
+    """`before`: the set `train` is complete when training starts, and held in memory. `beside`: up to `train.count` frames
+    are drawn while it runs and used as they come, which needs `--voxcast`."""
+    ready: int = 256
+    """Frames that must be there before the first step, if they are drawn beside it."""
+    drawers: int = 0
+    """Processes that draw; 0: one for each core but two."""
+    jitter: Jitter | None = None
+    """The other rigs to train for, if frames are drawn beside."""
+    tail: Tail | None = None
+    """What is done with the last stage afterwards, if anything."""
+    masked: float = 0.0
+    """Share of the frames of which one camera is masked: its pixels are left out of every mean."""
     seed: int = 0
     learning_rate: float = 2e-3
     """Peak; reached linearly over `warm_up` steps, then falling to nothing along a cosine. Where a phase starts to teach the
@@ -75,6 +116,9 @@ class Config:
     log_every: int = 20
     save_every: int = 500
     evaluate_every: int = 1000
+    save_seconds: float = 60.0
+    evaluate_seconds: float = 90.0
+    """With `minutes`, instead of steps."""
     directory: Path = field(default=Path("."), compare=False)
 
     @staticmethod
@@ -84,6 +128,10 @@ class Config:
         try:
             values = json.loads(path.read_text())
             sets = {key: Seeds(**values.pop(key)) for key in ("train", "tune", "held_out")}
+            if values.get("jitter") is not None:
+                values["jitter"] = Jitter(**values["jitter"])
+            if values.get("tail") is not None:
+                values["tail"] = Tail(**values["tail"])
             if "phases" in values:
                 values["phases"] = tuple(Phase(**phase) for phase in values["phases"])
             config = Config(**sets, **values, directory=path.parent)
@@ -91,6 +139,14 @@ class Config:
             raise InputError(f"{path}: {error}") from error
         if config.precision not in ("f32", "bf16"):
             raise InputError(f'{path}: "precision": found {config.precision}, expected f32 or bf16')
+        if config.drawn not in ("before", "beside"):
+            raise InputError(f'{path}: "drawn": found {config.drawn}, expected before or beside')
+        if config.drawn == "beside" and config.workers != 1:
+            raise InputError(f'{path}: "workers": found {config.workers}, expected 1 where frames are drawn beside')
+        if config.jitter is not None and config.drawn != "beside":
+            raise InputError(f'{path}: "jitter": found with frames drawn before, expected "drawn": "beside"')
+        if config.minutes is not None and config.workers != 1:
+            raise InputError(f'{path}: "workers": found {config.workers}, expected 1 with "minutes"')
         starts = [phase.start for phase in config.phases]
         if starts[:1] != [0] or starts != sorted(set(starts)):
             raise InputError(f'{path}: "phases": found starts {starts}, expected ascending ones from 0 on')
@@ -103,11 +159,11 @@ class Config:
     def load_network(self) -> Network:
         return Network.load(self.directory / self.network)
 
-    def phase(self, step: int) -> Phase:
+    def phase(self, step: float) -> Phase:
         """The phase that a step belongs to."""
         return [phase for phase in self.phases if phase.start <= step][-1]
 
-    def warmed_from(self, step: int) -> int:
+    def warmed_from(self, step: float) -> int:
         """The step from which on the rate rises to that of `step`."""
         first = 0
         for before, phase in zip(self.phases, self.phases[1:]):
@@ -119,7 +175,9 @@ class Config:
         """What must not change between a run and its continuation. A run may be made longer or shorter, and get
         other phases: from then on, the new ones count."""
         values = asdict(self)
-        for key in ("directory", "steps", "phases", "threads", "log_every", "save_every", "evaluate_every", "tune", "held_out"):
+        free = ("directory", "steps", "minutes", "phases", "threads", "drawers", "ready", "log_every", "save_every", "evaluate_every",
+                "save_seconds", "evaluate_seconds", "tune", "held_out", "tail")  # fmt: skip
+        for key in free:
             del values[key]
         assert set(values) < {f.name for f in fields(self)}
         return values

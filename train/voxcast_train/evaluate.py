@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file
 
 from .data import Frames
@@ -17,20 +18,45 @@ from .errors import InputError
 from .files import replace
 from .metrics import Confusion, table
 from .network import InverseMatrixVT3D, Network
-from .rig import Rig
+from .rig import Rig, Rigs
+from .unpack import unpack
+
+
+GPU_BATCH = 10
+"""Frames that a GPU evaluates at once."""
 
 
 @torch.no_grad()
-def evaluate(model: InverseMatrixVT3D, rig: Rig, frames: Frames, device: torch.device, precision: str = "f32") -> Confusion:
-    """Runs every frame, one at a time, in evaluation mode, and leaves the model in that mode."""
+def evaluate(model: InverseMatrixVT3D, rig: Rig, frames: Frames, device: torch.device, precision: str = "f32",
+             masked: int | None = None, others_than: int | None = None) -> Confusion:  # fmt: skip
+    """Runs every frame in evaluation mode and leaves the model in that mode. With a `masked` camera, "seen" are the visible
+    voxels that the others have in their images; with `others_than` too, but then that camera is there."""
     model.eval()
-    confusion = Confusion(model.network)
-    for number in range(len(frames)):
-        batch = frames.batch([number])
+    network = model.network
+    confusion = Confusion(network)
+    kept, covered = None, True
+    left_out = others_than if masked is None else masked
+    if left_out is not None:
+        others = (torch.arange(network.cameras, device=device) != left_out).float()
+        covered = covered_by(rig, network, others)
+        kept = None if masked is None else others
+    for first in range(0, len(frames), GPU_BATCH if device.type == "cuda" else 1):
+        numbers = list(range(first, min(first + (GPU_BATCH if device.type == "cuda" else 1), len(frames))))
+        batch = frames.batch(numbers)
         with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
-            logits = model(batch["images"].to(device), rig)[0]
-        confusion.add(logits[0].argmax(-1).cpu(), batch["labels"][0][0], batch["visible"][0])
+            kept_of = None if kept is None else kept.expand(len(numbers), -1)
+            logits = model(batch["images"].to(device), rig, kept=kept_of)[0]
+        for number, predicted in enumerate(logits.argmax(-1).cpu()):
+            confusion.add(predicted, batch["labels"][0][number], (batch["visible"][number] != 0) & covered)
     return confusion
+
+
+def covered_by(rig: Rig, network: Network, kept: torch.Tensor) -> torch.Tensor:
+    """bool [X, Y, Z], which voxels of level 0 lie in one of level 1 that a kept camera has pixels of."""
+    covered = (rig.levels[0][0].shares @ kept > 1e-6).view(network.grids[0])
+    for axis in range(3):
+        covered = covered.repeat_interleave(2, axis)
+    return covered.cpu()
 
 
 def evaluate_majority(majority: torch.Tensor, frames: Frames) -> Confusion:
@@ -41,24 +67,33 @@ def evaluate_majority(majority: torch.Tensor, frames: Frames) -> Confusion:
     return confusion
 
 
-def model_of(network: Network, weights: dict) -> InverseMatrixVT3D:
-    """A model with these weights, in evaluation mode. Raises InputError for names or shapes that do not fit."""
-    model = InverseMatrixVT3D(network)
+def fitting(model: InverseMatrixVT3D, weights: dict, path) -> dict:
+    """The weights, if they are a model's: InputError for names or shapes that do not fit, naming the file."""
     own = model.state_dict()
     missing = [name for name in own if name not in weights and not name.endswith("num_batches_tracked")]
     wrong = [name for name in weights if name not in own or own[name].shape != weights[name].shape]
     if missing or wrong:
-        raise InputError(f"not weights of this network: {missing[:3]} are missing, {wrong[:3]} do not fit")
-    model.load_state_dict(weights, strict=False)
+        raise InputError(f"{path}: not weights of this network: {missing[:3]} are missing, {wrong[:3]} do not fit")
+    return weights
+
+
+def load_weights(model: InverseMatrixVT3D, path) -> bool:
+    """Fills a model with the weights of an exported checkpoint, or of a model file of `voxcast import`, and says whether it was
+    the latter, whose batch norms do nothing (`unpack`). Raises InputError naming the file."""
+    with safe_open(path, "pt") as file:
+        packed = "format" in (file.metadata() or {})
+    if packed:
+        unpack(path, model)
+    else:
+        model.load_state_dict(fitting(model, load_file(path), path), strict=False)
+    return packed
+
+
+def load_model(network: Network, path) -> InverseMatrixVT3D:
+    """A model with the weights of a file, as `load_weights` takes them, in evaluation mode."""
+    model = InverseMatrixVT3D(network)
+    load_weights(model, path)
     return model.eval()
-
-
-def load_model(network: Network, checkpoint) -> InverseMatrixVT3D:
-    """A model with the weights of an exported checkpoint. Raises InputError naming the file."""
-    try:
-        return model_of(network, load_file(checkpoint))
-    except InputError as error:
-        raise InputError(f"{checkpoint}: {error}") from error
 
 
 def main() -> int:
@@ -79,7 +114,7 @@ def main() -> int:
         device = torch.device(options.device)
         frames = Frames(options.set, network, pixels=False, limit=options.limit)
         model = load_model(network, options.checkpoint).to(device)
-        rig = Rig.load(options.rig, network).to(device)
+        rig = Rigs([Rig.load(options.rig, network)], device).select(0)
         reports = {"network": evaluate(model, rig, frames, device).report()}
         if options.train_set:
             majority = Frames(options.train_set, network, pixels=False).majority()

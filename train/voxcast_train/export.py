@@ -15,9 +15,11 @@ from .errors import InputError
 from .files import replace
 
 
-def export(weights: dict, path) -> None:
-    """Writes a state dict of `InverseMatrixVT3D` as .safetensors."""
+def export(weights: dict, path, half: bool = False) -> None:
+    """Writes a state dict of `InverseMatrixVT3D` as .safetensors; with `half`, matrices and filters as f16."""
     tensors = {name: tensor.cpu().contiguous() for name, tensor in weights.items() if not name.endswith("num_batches_tracked")}
+    if half:
+        tensors = {name: tensor.half() if tensor.ndim > 1 else tensor for name, tensor in tensors.items()}
     replace(path, lambda temporary: save_file(tensors, temporary))
 
 

@@ -324,8 +324,8 @@ class Level(nn.Module):
         self.aspp_xy = BottleneckAspp(channels)
         self.bev_attn_layer = EfficientVitBlock(channels, network.key_dims[index], self.grid[0])
 
-    def forward(self, features, matrices, batch):
-        volume, plane = (matrix.mean(features, batch) for matrix in matrices)
+    def forward(self, features, matrices, batch, kept=None):
+        volume, plane = (matrix.mean(features, batch, kept) for matrix in matrices)
         volume = volume.unflatten(1, tuple(self.grid)).permute(0, 4, 1, 2, 3)
         plane = plane.unflatten(1, tuple(self.grid[:2])).permute(0, 3, 1, 2)
         volume, plane = self.down_conv3d(volume), self.xy_conv(plane)
@@ -346,15 +346,24 @@ class ViewTransformer(nn.Module):
             setattr(self, f"refine_lvl{i}", nn.Sequential(*conv3d_norm_relu(channels[i], channels[i], 3)))
         self.imvts = nn.ModuleList(Level(network, i) for i in range(3))
 
-    def forward(self, features, rig: Rig, batch):
-        v1, v2, v3 = (level(x, matrices, batch) for level, x, matrices in zip(self.imvts, features, rig.levels))
+    def coarse(self, features, rig: Rig, batch, kept=None):
+        """Refined volumes of levels 1 to 3."""
+        v1, v2, v3 = (level(x, matrices, batch, kept) for level, x, matrices in zip(self.imvts, features, rig.levels))
         r3 = self.refine_lvl3(v3)
         # oneDNN's bf16 gradient of a transposed convolution reads memory that nobody wrote where an axis has length 1.
         with torch.autocast(r3.device.type, enabled=False):
             up3 = self.up_sample3(r3.float())
         r2 = self.refine_lvl2(v2 + up3)
         r1 = self.refine_lvl1(v1 + self.up_sample2(r2))
-        return self.refine_lvl0(self.up_sample1(r1)), r1, r2, r3
+        return r1, r2, r3
+
+    def fine(self, r1):
+        """The refined volume of level 0 out of that of level 1."""
+        return self.refine_lvl0(self.up_sample1(r1))
+
+    def forward(self, features, rig: Rig, batch, kept=None):
+        r1, r2, r3 = self.coarse(features, rig, batch, kept)
+        return self.fine(r1), r1, r2, r3
 
 
 class OccupancyHead(nn.Module):
@@ -380,25 +389,22 @@ class InverseMatrixVT3D(nn.Module):
         self.img_neck = Fpn(self.img_backbone.outputs[1:], network.fpn)
         self.view_transformer = ViewTransformer(network)
         self.occ_head = OccupancyHead(network)
+        self.register_buffer("mean", torch.tensor(MEAN_BGR).view(1, 3, 1, 1), persistent=False)
 
     def pyramid(self, images: Tensor) -> list:
         """Images [B, N, H, W, 3], BGR in 0..255, any float or u8 -> P3, P4, P5, each [B * N, fpn, h, w]."""
-        x = images.flatten(0, 1).permute(0, 3, 1, 2).float() - x_mean(images.device)
+        x = images.flatten(0, 1).permute(0, 3, 1, 2).float() - self.mean
         height, width = self.network.image
         x = F.pad(x, (0, width - x.shape[3], 0, height - x.shape[2])).contiguous(memory_format=torch.channels_last)
         return self.img_neck(self.img_backbone(x))
 
-    def volumes(self, pyramid: list, rig: Rig, batch: int) -> tuple:
-        """Refined volumes [B, C, X, Y, Z] of levels 0 to 3."""
-        return self.view_transformer(pyramid, rig, batch)
+    def volumes(self, pyramid: list, rig: Rig, batch: int, kept: Tensor | None = None) -> tuple:
+        """Refined volumes [B, C, X, Y, Z] of levels 0 to 3. Cameras that `kept` [B, N] has a 0 for are masked."""
+        return self.view_transformer(pyramid, rig, batch, kept)
 
-    def forward(self, images: Tensor, rig: Rig, levels=(0,)) -> list:
+    def forward(self, images: Tensor, rig: Rig, levels=(0,), kept: Tensor | None = None) -> list:
         """Logits [B, X, Y, Z, classes] of each level asked for."""
-        return self.occ_head(self.volumes(self.pyramid(images), rig, images.shape[0]), levels)
-
-
-def x_mean(device) -> Tensor:
-    return torch.tensor(MEAN_BGR, device=device).view(1, 3, 1, 1)
+        return self.occ_head(self.volumes(self.pyramid(images), rig, images.shape[0], kept), levels)
 
 
 def initialise(model: nn.Module) -> None:

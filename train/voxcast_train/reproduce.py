@@ -1,89 +1,97 @@
-"""From seeds to a model: makes the sets, builds the rig, trains, calibrates, exports, imports, evaluates.
+"""From seeds to a model: makes the sets, builds the rigs, trains, calibrates, exports, imports, evaluates, also across rigs.
 
     python -m voxcast_train.reproduce --config edge/config.json --work DIR --voxcast ../target/release/voxcast
 
-A run that starts from another one's model (`"after"`) finds that in DIR/first/model.safetensors, or makes it there.
+A run that starts from another one's model (`"after"`) finds that in DIR/first/model.safetensors, or makes it there; `--from` gives
+it another model or checkpoint to start from.
 What DIR already holds is kept, so a run that was interrupted goes on. DIR needs about 2 MB a frame.
 """
 
 import argparse
 import json
-import subprocess
 import sys
+from dataclasses import replace as changed
 from pathlib import Path
 
 import torch
 
+from . import rigs
+from .across import across, summary
 from .calibrate import calibrated
-from .config import Config, Seeds
+from .config import Config
 from .data import Frames
 from .errors import InputError
-from .evaluate import evaluate, evaluate_majority, load_model
+from .evaluate import evaluate_majority, load_model
 from .export import export
 from .files import replace
 from .metrics import table
-from .rig import Rig
+from .network import InverseMatrixVT3D
+from .program import Program
+from .rig import Rig, Rigs
+from .tail import train_tail
 from .train import run
 
 
-class Program:
-    """The `voxcast` that makes frames, rig and model."""
-
-    def __init__(self, path: Path):
-        self.path = path
-
-    def __call__(self, *arguments) -> None:
-        command = [str(self.path), *map(str, arguments)]
-        print("+", " ".join(command), flush=True)
-        try:
-            subprocess.run(command, check=True)
-        except subprocess.CalledProcessError as error:
-            raise InputError(f"{' '.join(command)}: exit status {error.returncode}") from error
-
-    def make_set(self, directory: Path, seeds: Seeds, network: Path) -> None:
-        """Writes the frames of these seeds, unless they are there."""
-        if len(list(directory.glob("[0-9]*.safetensors"))) < seeds.count:
-            self("synth", "--set", directory, "--seed", seeds.first, "--count", seeds.count, "--network", network, "--pixels")
-
-
-def train_model(config: Config, work: Path, voxcast: Program, device: torch.device) -> int:
-    """Makes a config's sets and rig in `work`, trains, and writes checkpoint.safetensors and model.safetensors there; first, in
-    `work`/first, the run that it starts from. Returns the number of steps."""
+def train_model(config: Config, work: Path, voxcast: Program, device: torch.device, start: Path | None = None) -> int:
+    """Makes a config's sets and rigs in `work`, trains, and writes checkpoint.safetensors and model.safetensors there; first, in
+    `work`/first, the run that it starts from, unless `start` is given. Returns the number of steps."""
     work.mkdir(parents=True, exist_ok=True)
-    start = None
-    if config.after is not None:
+    if config.after is not None and start is None:
         start = work / "first" / "model.safetensors"
         if not start.exists():
             train_model(Config.load(config.directory / config.after), work / "first", voxcast, device)
     network_path = config.directory / config.network
     network = config.load_network()
-    for name, seeds in (("train", config.train), ("tune", config.tune)):
-        voxcast.make_set(work / name, seeds, network_path)
-    first = next(iter(sorted((work / "train").glob("[0-9]*.safetensors"))))
-    voxcast("rig", first, "--network", network_path, "-o", work / "rig.safetensors")
-    run(config, work, device, start)
+    voxcast.make_set(work / "tune", config.tune.first, config.tune.count, network_path)
+    names, lidar2img = rigs.read_set(work / "tune")
+    if config.drawn == "beside":
+        make_rigs(config, work, names, lidar2img, voxcast)
+        plain = work / "rigs" / "00"
+    else:
+        voxcast.make_set(work / "train", config.train.first, config.train.count, network_path)
+        plain = work
+        rigs.make(plain, names, lidar2img, network, network_path, voxcast)
+    run(config, work, device, start, voxcast)
     state = torch.load(work / "state.pt", map_location="cpu", weights_only=True)
-    rig = Rig.load(work / "rig.safetensors", network)
+    rig = Rigs([Rig.load(plain / "rig.safetensors", network)], device).select(0)
     tuning = Frames([work / "tune"], network, pixels=False, limit=config.tune.count)
-    export(calibrated(state["average"], network, rig, tuning), work / "checkpoint.safetensors")
+    model = InverseMatrixVT3D(network)
+    model.load_state_dict(state["average"])
+    if config.tail is not None:
+        voxcast.make_set(work / "tail", config.tail.first, config.tail.count, network_path)
+        train_tail(model, rig, Frames([work / "tail"], network, pixels=False), config.tail, device, config.seed)
+    export(calibrated(model, rig, tuning, device), work / "checkpoint.safetensors", half=True)
     voxcast("import", work / "checkpoint.safetensors", "--network", network_path, "--precision", "f16", "-o", work / "model.safetensors")
     return state["step"]
 
 
-def reproduce(config: Config, work: Path, voxcast: Program, device: torch.device) -> dict:
+def make_rigs(config: Config, work: Path, names: list, lidar2img: torch.Tensor, voxcast: Program) -> None:
+    """The rigs of a run, the plain one first."""
+    count = 0 if config.jitter is None else config.jitter.rigs
+    for number in range(count + 1):
+        directory = work / "rigs" / f"{number:02}"
+        if (directory / "rig.safetensors").exists():
+            continue
+        moved = lidar2img
+        if number > 0:
+            moved = rigs.jittered(lidar2img, config.jitter.degrees, config.jitter.metres, 1000 * config.seed + number)
+        rigs.make(directory, names, moved, config.load_network(), config.directory / config.network, voxcast)
+
+
+def reproduce(config: Config, work: Path, voxcast: Program, device: torch.device, start: Path | None = None) -> dict:
     """Everything that the module's text says. Returns the reports of the held-out set by name."""
-    steps = train_model(config, work, voxcast, device)
+    steps = train_model(config, work, voxcast, device, start)
     network = config.load_network()
-    voxcast.make_set(work / "held-out", config.held_out, config.directory / config.network)
-    rig = Rig.load(work / "rig.safetensors", network)
-    held_out = Frames([work / "held-out"], network, pixels=False, limit=config.held_out.count)
-    majority = Frames([work / "train"], network, pixels=False, limit=config.train.count).majority()
-    model = load_model(network, work / "checkpoint.safetensors").to(device)
-    reports = {
-        "network": evaluate(model, rig.to(device), held_out, device).report(),
-        "majority": evaluate_majority(majority, held_out).report(),
-    }
-    text = json.dumps({"frames": len(held_out), "steps": steps, **reports}, indent=1) + "\n"
+    network_path = config.directory / config.network
+    model = load_model(network, work / "checkpoint.safetensors")
+    seeds = config.held_out
+    reports = across(model, network_path, work, voxcast, seeds.first, seeds.count, device)
+    # Where frames were drawn beside the training, the tuning set has to do for what is most frequent.
+    known = work / ("tune" if config.drawn == "beside" else "train")
+    majority = Frames([known], network, pixels=False).majority()
+    held_out = Frames([work / "held-out"], network, pixels=False, limit=seeds.count)
+    reports["majority"] = evaluate_majority(majority, held_out).report()
+    text = json.dumps({"frames": seeds.count, "steps": steps, **reports}, indent=1) + "\n"
     replace(work / "quality.json", lambda temporary: temporary.write_text(text))
     return reports
 
@@ -94,13 +102,21 @@ def main() -> int:
     parser.add_argument("--work", required=True, type=Path)
     parser.add_argument("--voxcast", required=True, type=Path, help="the program, built with --release")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--minutes", type=float, help="time to train for, instead of the config's")
+    parser.add_argument("--from", dest="start", type=Path, metavar="FILE", help="start from the weights of a model or checkpoint")
     options = parser.parse_args()
     try:
-        reports = reproduce(Config.load(options.config), options.work, Program(options.voxcast), torch.device(options.device))
+        config = Config.load(options.config)
+        if options.minutes is not None:
+            config = changed(config, minutes=options.minutes)
+        device = torch.device(options.device)
+        reports = reproduce(config, options.work, Program(options.voxcast), device, options.start)
     except (InputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print(table(reports))
+    print(table({name: reports[name] for name in ("plain", "majority")}))
+    print()
+    print(summary({name: report for name, report in reports.items() if name != "majority"}))
     return 0
 
 

@@ -37,7 +37,7 @@ class GatherMean(torch.autograd.Function):
 class Matrix:
     """One 0/1 matrix as compressed rows, scaled so that a product with it is a mean. A row without entries gives 0."""
 
-    def __init__(self, ptr: Tensor, col: Tensor, pixels: int):
+    def __init__(self, ptr: Tensor, col: Tensor, pixels: int, cameras: int):
         rows = len(ptr) - 1
         lengths = ptr[1:] - ptr[:-1]
         row = torch.repeat_interleave(torch.arange(rows), lengths)
@@ -47,19 +47,76 @@ class Matrix:
         transposed_ptr[1:] = torch.bincount(col, minlength=pixels).cumsum(0)
         self.forward = compressed(ptr, col, values, (rows, pixels))
         self.backward = compressed(transposed_ptr, row[order], values[order], (pixels, rows))
+        self.shares = torch.zeros(rows, cameras)
+        """Part of each row's pixels that each camera has."""
+        self.shares.view(-1).index_add_(0, row * cameras + col // (pixels // cameras), values)
+        self.counts = lengths.float()
+        """Pixels of each row."""
 
     def to(self, device) -> "Matrix":
-        self.forward, self.backward = self.forward.to(device), self.backward.to(device)
+        for name in ("forward", "backward", "shares", "counts"):
+            setattr(self, name, getattr(self, name).to(device))
         return self
 
-    def mean(self, features: Tensor, batch: int) -> Tensor:
-        """Feature maps [B * N, C, h, w] -> f32 [B, rows, C]."""
-        channels = features.shape[1]
-        # [B, pixels, C] -> [pixels, B * C]: one product serves all frames.
-        pixels = features.float().permute(0, 2, 3, 1).reshape(batch, -1, channels)
-        columns = pixels.transpose(0, 1).reshape(-1, batch * channels)
-        rows = GatherMean.apply(columns, self.forward, self.backward)
-        return rows.view(-1, batch, channels).transpose(0, 1)
+    def columns(self, features: Tensor, batch: int, kept: Tensor | None) -> Tensor:
+        """Feature maps [B * N, C, h, w] -> [pixels, B * C], so that one product serves all frames; 0 where `kept` [B, N] is."""
+        pixels = features.permute(0, 2, 3, 1).reshape(batch, -1, features.shape[1])
+        if kept is not None:
+            parts = pixels.unflatten(1, (kept.shape[1], -1))
+            pixels = (parts * kept.to(parts.dtype)[:, :, None, None]).flatten(1, 2)
+        return pixels.transpose(0, 1).reshape(pixels.shape[1], -1)
+
+    def product(self, columns: Tensor) -> Tensor:
+        """The means of columns, f32."""
+        return GatherMean.apply(columns.float(), self.forward, self.backward)
+
+    def mean(self, features: Tensor, batch: int, kept: Tensor | None = None) -> Tensor:
+        """Feature maps [B * N, C, h, w] -> f32 [B, rows, C]. Cameras that `kept` [B, N] has a 0 for are masked: the mean
+        is over the pixels of the others, and 0 where there are none, as at run time."""
+        rows = self.product(self.columns(features, batch, kept))
+        rows = rows.view(rows.shape[0], batch, -1).transpose(0, 1)
+        if kept is None:
+            return rows
+        share = kept @ self.shares.t()
+        # Sums of shares that are 0 but for rounding belong to rows that no kept camera sees.
+        return rows * torch.where(share > 1e-6, 1.0 / share.clamp(min=1e-6), 0.0).unsqueeze(-1)
+
+
+class DenseMatrix(Matrix):
+    """A matrix for GPUs, with a value for every pixel: there a dense product in bf16, whose zeros and ones are exact, takes a
+    fraction of a sparse one's time. `ones` [rows, pixels] and `counts` [rows], the pixels of each row."""
+
+    def __init__(self, ones: Tensor, counts: Tensor, shares: Tensor):
+        self.ones, self.counts, self.shares = ones, counts, shares
+
+    def product(self, columns: Tensor) -> Tensor:
+        return (self.ones @ columns.to(self.ones.dtype)).float() / self.counts.clamp(min=1).unsqueeze(1)
+
+
+class Rigs:
+    """Several rigs of one network on one device. `select` gives one of them."""
+
+    def __init__(self, rigs: list, device: torch.device):
+        self.dense = device.type == "cuda"
+        self.count = len(rigs)
+        if not self.dense:
+            self.rigs = [rig.to(device) for rig in rigs]
+            return
+        self.levels = []
+        for level in range(3):
+            pair = []
+            for part in range(2):
+                matrices = [rig.levels[level][part] for rig in rigs]
+                ones = torch.stack([(m.forward.to(device).to_dense() > 0).to(torch.bfloat16) for m in matrices])
+                pair.append((ones, *(torch.stack([getattr(m, name) for m in matrices]).to(device) for name in ("counts", "shares"))))
+            self.levels.append(pair)
+
+    def select(self, number) -> "Rig":
+        """The rig of a number; on a GPU that is a tensor [1] there, so that a recorded step can use another each time."""
+        if not self.dense:
+            return self.rigs[int(number)]
+        number = torch.as_tensor(number, device=self.levels[0][0][0].device).view(1)
+        return Rig([tuple(DenseMatrix(*(t.index_select(0, number)[0] for t in part)) for part in pair) for pair in self.levels])
 
 
 class Rig:
@@ -85,7 +142,7 @@ class Rig:
                     raise InputError(f"{path}: no tensor {error}") from error
                 if len(ptr) != rows + 1 or (len(col) and int(col.max()) >= pixels):
                     raise InputError(f"{path}: {name}: found {len(ptr) - 1} rows, expected {rows}, of columns below {pixels}")
-                pair.append(Matrix(ptr, col, pixels))
+                pair.append(Matrix(ptr, col, pixels, network.cameras))
             levels.append(tuple(pair))
         return Rig(levels)
 
