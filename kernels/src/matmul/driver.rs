@@ -475,10 +475,10 @@ impl<T: Target, const P: usize> Tile<'_, '_, T, P> {
         for piece in 0..pieces.count {
             let len = pieces.len[piece];
             let a = core::array::from_fn(|r| pieces.start[piece][self.i + r]);
-            let weights = self.weights.map(|w| &w[k * LANES..(k + len) * LANES]);
-            // SAFETY: `Pieces::find` set these pointers to pieces of `len` numbers each, in this k block, and nothing
-            // has written there since.
-            sums = unsafe { multiply(s, a, weights, len, sums) };
+            let weights = self.weights.map(|w| w[k * LANES..(k + len) * LANES].as_ptr());
+            // SAFETY: `Pieces::find` set the pointers of `a` to pieces of `len` numbers each, in this k block, and nothing
+            // has written there since; the slices of weights are as deep.
+            sums = unsafe { s.multiply(a, weights, len, sums) };
             k += len;
         }
         for r in 0..N {
@@ -508,39 +508,4 @@ impl<T: Target, const P: usize> Tile<'_, '_, T, P> {
 #[inline(always)]
 fn load<S: Simd, const WHOLE: bool>(s: S, x: &[f32]) -> S::V {
     if WHOLE { s.load(x.first_chunk().expect("16 columns")) } else { s.load_part(x) }
-}
-
-/// `sums[r][j] += a[r][k] * weights[j][k]` for k ascending: the loop that the whole library spends its time in.
-///
-/// # Panics
-/// If the weights are not `depth` rows of 16.
-///
-/// # Safety
-/// Each pointer must be valid for reading `depth` numbers.
-#[inline(always)]
-unsafe fn multiply<S: Simd, const N: usize, const P: usize>(
-    s: S,
-    a: [*const f32; N],
-    weights: [&[f32]; P],
-    depth: usize,
-    mut sums: [[S::V; P]; N],
-) -> [[S::V; P]; N] {
-    assert!(weights.iter().all(|w| w.len() == depth * LANES), "the weights are not as deep as the piece");
-    let weights = weights.map(|w| w.as_ptr());
-    for k in 0..depth {
-        // SAFETY: k < depth, within the weights and, as the caller promises, within every row's piece.
-        unsafe {
-            let mut w = [s.splat(0.0); P];
-            for j in 0..P {
-                w[j] = s.load_ptr(weights[j].add(k * LANES));
-            }
-            for r in 0..N {
-                let a = s.splat(*a[r].add(k));
-                for j in 0..P {
-                    sums[r][j] = s.mul_add(a, w[j], sums[r][j]);
-                }
-            }
-        }
-    }
-    sums
 }
