@@ -22,7 +22,6 @@ mod simd;
 mod testing;
 
 pub use isa::{Isa, IsaError};
-pub use matmul::layout as panels;
-pub use matmul::{self as product, Panels};
+pub use matmul::{self as product, Panels, layout as panels};
 pub use ops::*;
 pub use simd::{LANES, Tile, relu};

@@ -55,7 +55,7 @@ pub(crate) trait Simd: Copy {
     /// Calls `body` for as many rows as a tile can have and `left`, which is not 0, allow. Returns how many those were.
     fn rows<B: TileRows<Self>>(self, left: usize, body: B) -> usize;
 
-    /// `sums[r][j] += left[r][k] * panels[j][k]` for k ascending: the loop that the whole library spends its time in.
+    /// `sums[r][j] += left[r][k] * panels[j][k]` for k ascending, each a chain of fused multiply-adds.
     ///
     /// # Safety
     /// Each pointer in `left` must be valid for reading `depth` numbers, each in `panels` for `depth` times [`LANES`].
@@ -135,7 +135,7 @@ pub(crate) trait Simd: Copy {
     fn both(self, a: Self::M, b: Self::M) -> Self::M;
 
     /// Names the cache line of `p` to the first-level cache. Any address will do; nothing is read.
-    fn prefetch(self, p: *const f32);
+    fn prefetch<T>(self, p: *const T);
 
     /// Reads 16 lanes.
     #[inline(always)]

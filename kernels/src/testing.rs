@@ -1,7 +1,7 @@
 //! What the kernels' tests share: numbers to compute with, and comparisons that name the place of a difference.
 
-use crate::matmul::driver::{Product, Residual};
-use crate::matmul::layout::{Panels, pack, packed_len};
+use crate::matmul::layout::{pack, packed_len};
+use crate::matmul::{Panels, Product, Residual};
 use half::f16;
 
 /// A small generator (splitmix64), so that tests see the same numbers everywhere.

@@ -7,7 +7,7 @@
 //! packed[(n / 16 * depth + k) * 16 + n % 16] = w[k][n]
 //! ```
 
-use crate::simd::LANES;
+use crate::simd::{LANES, Simd};
 use half::f16;
 
 /// Packed weights in the precision that they are stored in. Arithmetic is f32 in both cases; widening is exact.
@@ -43,7 +43,44 @@ impl Panels<'_> {
     }
 }
 
-/// Numbers that a packed `depth` x `columns` matrix takes.
+/// Packed weights as a tile reads them.
+pub(crate) trait Packed<S: Simd> {
+    /// What a tile reads.
+    type Element: Copy;
+    /// As many elements from packed position `i` on as `spare` has: where they are stored, or in `spare` if they are stored
+    /// in another form.
+    fn read<'a>(&'a self, s: S, i: usize, spare: &'a mut [Self::Element]) -> &'a [Self::Element];
+    /// Where packed position `i` is stored, if a tile reads it there, else null.
+    fn address(&self, i: usize) -> *const Self::Element;
+}
+
+impl<S: Simd> Packed<S> for Panels<'_> {
+    type Element = f32;
+
+    #[inline(always)]
+    fn read<'a>(&'a self, s: S, i: usize, spare: &'a mut [f32]) -> &'a [f32] {
+        match self {
+            Panels::F32(w) => &w[i..][..spare.len()],
+            Panels::F16(w) => {
+                let (narrow, _) = w[i..][..spare.len()].as_chunks();
+                for (narrow, wide) in narrow.iter().zip(spare.as_chunks_mut().0) {
+                    s.store(wide, s.widen(narrow));
+                }
+                spare
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn address(&self, i: usize) -> *const f32 {
+        match self {
+            Panels::F32(w) => w[i..].as_ptr(),
+            Panels::F16(_) => core::ptr::null(),
+        }
+    }
+}
+
+/// Values that a packed `depth` x `columns` matrix takes.
 pub const fn packed_len(depth: usize, columns: usize) -> usize {
     columns.div_ceil(LANES) * LANES * depth
 }
@@ -72,7 +109,7 @@ pub fn pack(depth: usize, columns: usize, w: impl Fn(usize, usize) -> f32, out: 
 mod tests {
     use super::*;
     use crate::isa::Isa;
-    use crate::simd::{Kernel, Simd, dispatch};
+    use crate::simd::{Kernel, dispatch};
 
     #[test]
     fn every_element_has_its_own_place_and_the_rest_is_zero() {

@@ -1,4 +1,5 @@
-use super::driver::*;
+use super::driver::{DEPTH, Source};
+use super::product::{Product, Rows, SCRATCH};
 use crate::isa::Isa;
 use crate::simd::Simd;
 use crate::testing::{
@@ -19,6 +20,7 @@ struct Case {
 }
 
 impl Source for Case {
+    type Element = f32;
     type At = usize;
     type Part = usize;
 

@@ -11,7 +11,9 @@
 //! needs none: its rows lie in memory already.
 
 use crate::isa::Isa;
-use crate::matmul::driver::{DEPTH, PIECES, Product, Rows, Source};
+use crate::matmul::Product;
+use crate::matmul::driver::{DEPTH, PIECES, Source};
+use crate::matmul::product::Rows;
 use crate::simd::Simd;
 use core::ops::Range;
 
@@ -86,7 +88,7 @@ pub struct Conv<'a> {
 }
 
 /// Convolves the output rows `rows` (positions in depth, height, width order) into `out`, which holds exactly those rows,
-/// `stride` numbers apart. `scratch` holds [`crate::matmul::driver::SCRATCH`] numbers of any value.
+/// `stride` numbers apart. `scratch` holds [`crate::matmul::SCRATCH`] numbers of any value.
 ///
 /// # Panics
 /// If a slice does not have the size that the shapes ask for.
@@ -169,6 +171,7 @@ impl Conv<'_> {
 }
 
 impl Source for Conv<'_> {
+    type Element = f32;
     type At = [usize; 3];
     type Part = Stretch;
 

@@ -11,8 +11,9 @@
 //! other, parity `(p_d * 2 + p_h) * 2 + p_w`; [`kernel_tap`] says which of the four taps each of their rows is.
 
 use crate::isa::Isa;
-use crate::matmul::driver::{Product, Residual, Source, Target, product};
-use crate::matmul::layout::{Panels, packed_len};
+use crate::matmul::driver::{Source, Target};
+use crate::matmul::layout::packed_len;
+use crate::matmul::{Panels, Product, Residual};
 use crate::ops::conv::{Conv, Geometry};
 use crate::simd::{Kernel, Simd, dispatch};
 use core::ops::Range;
@@ -44,7 +45,7 @@ pub struct Deconv3d<'a> {
 }
 
 /// Computes the planes `planes` of the output's first axis into `out`, which holds exactly those, densely. `scratch`
-/// holds [`crate::matmul::driver::SCRATCH`] numbers of any value.
+/// holds [`crate::matmul::SCRATCH`] numbers of any value.
 ///
 /// # Panics
 /// If a slice does not have the size that the shapes ask for.
@@ -181,7 +182,7 @@ impl Kernel for Run<'_> {
     fn run<S: Simd>(self, s: S) {
         self.each(
             #[inline(always)]
-            |conv, rows, target, out, scratch| product(s, &conv.product, conv, target, rows, out, scratch),
+            |conv, rows, target, out, scratch| conv.product.compute(s, conv, target, rows, out, scratch),
         );
     }
 }
@@ -189,7 +190,7 @@ impl Kernel for Run<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::matmul::driver::SCRATCH;
+    use crate::matmul::SCRATCH;
     use crate::matmul::layout::pack;
     use crate::testing::{
         Fill, Rng, Tally, assert_close, assert_lively, assert_order_shows, assert_same_bits, pad_rows,

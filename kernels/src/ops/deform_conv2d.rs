@@ -17,7 +17,9 @@ use crate::isa::Isa;
 #[cfg(not(feature = "std"))]
 use crate::math::Float as _;
 use crate::math::sigmoid;
-use crate::matmul::driver::{DEPTH, Product, Rows, Source};
+use crate::matmul::Product;
+use crate::matmul::driver::{DEPTH, Source};
+use crate::matmul::product::Rows;
 use crate::ops::conv::Geometry;
 use crate::simd::{LANES, Simd};
 use core::ops::Range;
@@ -36,7 +38,7 @@ pub struct DeformConv2d<'a> {
 }
 
 /// Convolves the output rows `rows` into `out`, which holds exactly those rows, `stride` numbers apart. `scratch` holds
-/// [`crate::matmul::driver::SCRATCH`] numbers of any value.
+/// [`crate::matmul::SCRATCH`] numbers of any value.
 ///
 /// Offsets may be anything; a sample whose position is NaN is 0.
 ///
@@ -110,6 +112,7 @@ impl DeformConv2d<'_> {
 }
 
 impl Source for DeformConv2d<'_> {
+    type Element = f32;
     /// The row and its position in the output.
     type At = (usize, [usize; 3]);
     type Part = usize;

@@ -9,8 +9,8 @@
 //! that comes first.
 
 use crate::isa::Isa;
-use crate::matmul::driver::{BLOCK_ROWS, Linear, Product, Residual, SCRATCH, Source, product};
-use crate::matmul::layout::Panels;
+use crate::matmul::driver::{Linear, Source};
+use crate::matmul::{BLOCK_ROWS, Panels, Product, Residual, SCRATCH};
 use crate::simd::{Kernel, Simd, dispatch};
 use core::ops::Range;
 
@@ -82,6 +82,7 @@ struct Rows<'a> {
 }
 
 impl Source for Rows<'_> {
+    type Element = f32;
     type At = usize;
     type Part = usize;
 
@@ -190,7 +191,7 @@ impl Kernel for Run<'_> {
                     let (data, to) = between(layer, input, a, b, logits);
                     let p = args.layer(layer);
                     let (source, target) = (Rows { data, stride: p.depth }, Linear { first: 0, stride: p.columns });
-                    product(s, &p, &source, &target, 0..count, to, scratch);
+                    p.compute(s, &source, &target, 0..count, to, scratch);
                 }
             },
         );

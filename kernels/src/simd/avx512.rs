@@ -144,7 +144,7 @@ impl Simd for Avx512 {
         a & b
     }
     #[inline(always)]
-    fn prefetch(self, p: *const f32) {
+    fn prefetch<T>(self, p: *const T) {
         // SAFETY: a prefetch is a hint that never faults; x86-64 always has it.
         unsafe { _mm_prefetch::<_MM_HINT_T0>(p.cast()) }
     }

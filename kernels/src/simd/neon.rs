@@ -125,8 +125,8 @@ impl Simd for Neon {
             let mut out = self.splat(0.0);
             for (h, half) in halves.into_iter().enumerate() {
                 let (low, high);
-                asm!("fcvtl {}.4s, {}.4h", lateout(vreg) low, in(vreg) half, options(pure, nomem, nostack, preserves_flags));
-                asm!("fcvtl2 {}.4s, {}.8h", lateout(vreg) high, in(vreg) half, options(pure, nomem, nostack, preserves_flags));
+                asm!("fcvtl {:v}.4s, {:v}.4h", lateout(vreg) low, in(vreg) half, options(pure, nomem, nostack, preserves_flags));
+                asm!("fcvtl2 {:v}.4s, {:v}.8h", lateout(vreg) high, in(vreg) half, options(pure, nomem, nostack, preserves_flags));
                 (out[2 * h], out[2 * h + 1]) = (low, high);
             }
             out
@@ -215,7 +215,7 @@ impl Simd for Neon {
         quarters!(vandq_u32(a, b))
     }
     #[inline(always)]
-    fn prefetch(self, p: *const f32) {
+    fn prefetch<T>(self, p: *const T) {
         // SAFETY: a prefetch is a hint that never faults. The compiler has no stable intrinsic for it.
         unsafe { asm!("prfm pldl1keep, [{}]", in(reg) p, options(readonly, nostack, preserves_flags)) }
     }

@@ -1,5 +1,5 @@
 use super::*;
-use crate::matmul::driver::SCRATCH;
+use crate::matmul::SCRATCH;
 use crate::testing::{
     Fill, JOINS, Joins, Owned, PLAIN, Rng, Tally, Way, assert_close, assert_lively, assert_order_shows,
     assert_same_bits, reverse_channels, reverse_columns, round_to, ways, write_rows,

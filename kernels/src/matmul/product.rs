@@ -1,0 +1,154 @@
+//! The arguments of a product in f32, and its specification.
+
+use super::driver::{self, BLOCK_LEN, Linear, PANEL_LEN, Source, Target};
+use super::epilogue::{End, Residual};
+use super::layout::{Panels, packed_index};
+use super::tile::Single;
+use crate::isa::Isa;
+#[cfg(not(feature = "std"))]
+use crate::math::Float as _;
+use crate::simd::{Kernel, LANES, Simd, dispatch};
+use core::ops::Range;
+
+/// f32 of scratch that one call needs.
+pub const SCRATCH: usize = BLOCK_LEN + PANEL_LEN;
+
+/// The right matrix and what happens at both ends of each chain.
+#[derive(Clone, Copy, Debug)]
+pub struct Product<'a> {
+    /// Packed weights of `depth` x `columns`.
+    pub weights: Panels<'a>,
+    /// One number per column, padded with anything to a multiple of 16.
+    pub bias: &'a [f32],
+    /// Length of every chain.
+    pub depth: usize,
+    /// Output columns.
+    pub columns: usize,
+    /// Whether negative results become 0.
+    pub relu: bool,
+    /// What is added.
+    pub residual: Residual<'a>,
+}
+
+impl Product<'_> {
+    /// # Panics
+    /// If a slice does not fit a product of `rows` rows, or the scratch is smaller than [`SCRATCH`].
+    pub(crate) fn check(&self, rows: usize, scratch: &[f32]) {
+        let padded = self.columns.checked_next_multiple_of(LANES).expect("the columns overflow");
+        assert_eq!(Some(self.weights.len()), padded.checked_mul(self.depth), "packed weights do not match the shape");
+        assert!(self.bias.len() >= padded, "the bias is shorter than the columns");
+        if let Residual::Before { rows: added, stride } | Residual::After { rows: added, stride } = self.residual {
+            assert!(added.len() >= span(rows, stride, self.columns), "the residual is shorter than the rows");
+        }
+        assert!(scratch.len() >= SCRATCH, "the scratch is too small");
+    }
+
+    /// [`Product::check`] for the rows `rows` of `total` that go to `out`, `stride` apart.
+    ///
+    /// # Panics
+    /// As [`Product::check`], and if `out` does not hold the rows.
+    pub(crate) fn check_rows(&self, rows: &Range<usize>, total: usize, stride: usize, out: &[f32], scratch: &[f32]) {
+        self.check(rows.end, scratch);
+        assert!(rows.start <= rows.end && rows.end <= total, "rows {rows:?} of {total}");
+        assert!(stride >= self.columns, "output rows overlap");
+        assert!(out.len() >= span(rows.len(), stride, self.columns), "the output is shorter than its rows");
+    }
+
+    fn end(&self) -> End<'_> {
+        End { bias: Some(self.bias), relu: self.relu, residual: self.residual }
+    }
+
+    /// The specification of row `row`: `a(k)` is the left row, `out` holds the outputs and before that whatever was
+    /// there, `residual_row` is the row in the residual's tensor.
+    ///
+    /// Sixteen chains advance side by side, so that an element of the left row is looked up once for all.
+    #[inline(always)]
+    pub(crate) fn reference(&self, residual_row: usize, out: &mut [f32], a: impl Fn(usize) -> f32) {
+        let end = self.end();
+        for (panel, out) in out.chunks_mut(LANES).enumerate() {
+            let column = panel * LANES;
+            let mut sums = [0.0; LANES];
+            for (i, out) in out.iter().enumerate() {
+                sums[i] = end.start(residual_row, column + i, *out);
+            }
+            for k in 0..self.depth {
+                let (x, weights) = (a(k), self.weights.lanes(packed_index(self.depth, k, column)));
+                for (sum, weight) in sums.iter_mut().zip(weights) {
+                    *sum = x.mul_add(weight, *sum);
+                }
+            }
+            for (i, out) in out.iter_mut().enumerate() {
+                *out = end.finish(residual_row, column + i, sums[i]);
+            }
+        }
+    }
+
+    /// Computes `rows` of the product with the left matrix `left`. `scratch` must hold [`SCRATCH`] values.
+    #[inline(always)]
+    pub(crate) fn compute<S: Simd>(
+        &self,
+        s: S,
+        left: &impl Source<Element = f32>,
+        target: &impl Target,
+        rows: Range<usize>,
+        out: &mut [f32],
+        scratch: &mut [f32],
+    ) {
+        let (block, panels) = scratch[..SCRATCH].split_at_mut(BLOCK_LEN);
+        let product =
+            driver::Product { left, weights: &self.weights, target, depth: self.depth, columns: self.columns };
+        product.compute::<Single, S, _>(s, &mut self.end(), rows, out, block, panels);
+    }
+}
+
+/// Numbers from the first of `rows` rows, `stride` apart, to the last one's end.
+fn span(rows: usize, stride: usize, columns: usize) -> usize {
+    rows.checked_sub(1).map_or(0, |before| before.saturating_mul(stride).saturating_add(columns))
+}
+
+/// A product whose output rows go one after the other: what a convolution is.
+pub(crate) struct Rows<'a, A> {
+    pub(crate) product: &'a Product<'a>,
+    pub(crate) source: &'a A,
+    pub(crate) rows: Range<usize>,
+    /// Distance between rows of `out`, which starts at the first of them.
+    pub(crate) stride: usize,
+    pub(crate) out: &'a mut [f32],
+    pub(crate) scratch: &'a mut [f32],
+}
+
+impl<A: Source<Element = f32>> Rows<'_, A> {
+    /// Computes the rows, of `total`, on `isa`.
+    ///
+    /// # Panics
+    /// As [`Product::check_rows`].
+    #[inline]
+    pub(crate) fn compute(self, isa: Isa, total: usize) {
+        self.product.check_rows(&self.rows, total, self.stride, self.out, self.scratch);
+        dispatch(isa, self);
+    }
+}
+
+impl<A: Source<Element = f32>> Kernel for Rows<'_, A> {
+    type Output = ();
+
+    #[inline(always)]
+    fn reference(self) {
+        let first = self.rows.start;
+        for row in self.rows {
+            let out = &mut self.out[(row - first) * self.stride..][..self.product.columns];
+            self.product.reference(
+                row,
+                out,
+                #[inline(always)]
+                |k| self.source.element(row, k),
+            );
+        }
+    }
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) {
+        let target = Linear { first: self.rows.start, stride: self.stride };
+        self.product.compute(s, self.source, &target, self.rows, self.out, self.scratch);
+    }
+}

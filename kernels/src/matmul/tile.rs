@@ -1,0 +1,173 @@
+//! The register tile: some rows by one or two vectors of columns, all of whose sums stay in registers.
+
+use super::driver::Target;
+use super::epilogue::{Epilogue, Place};
+use crate::simd::{LANES, Simd, TileRows};
+use core::marker::PhantomData;
+
+/// Which values a product multiplies and sums, and how an instruction set does it.
+pub(crate) trait Arithmetic<S: Simd> {
+    /// Element of the left matrix.
+    type Left: Copy;
+    /// Element of a packed panel.
+    type Right: Copy;
+    /// Sixteen sums in registers.
+    type Sums: Copy;
+
+    /// `sums[r][j] += left[r][k] * panels[j][k]` for k ascending: the loop that the whole library spends its time in.
+    /// Must be `#[inline(always)]`.
+    ///
+    /// # Panics
+    /// If a panel is not `depth` rows of 16.
+    ///
+    /// # Safety
+    /// Each pointer must be valid for reading `depth` elements.
+    unsafe fn multiply<const N: usize, const P: usize>(
+        s: S,
+        left: [*const Self::Left; N],
+        panels: [&[Self::Right]; P],
+        depth: usize,
+        sums: [[Self::Sums; P]; N],
+    ) -> [[Self::Sums; P]; N];
+}
+
+/// f32 times f32, summed in f32: one chain of fused multiply-adds per output.
+pub(crate) struct Single;
+
+impl<S: Simd> Arithmetic<S> for Single {
+    type Left = f32;
+    type Right = f32;
+    type Sums = S::V;
+
+    #[inline(always)]
+    unsafe fn multiply<const N: usize, const P: usize>(
+        s: S,
+        left: [*const f32; N],
+        panels: [&[f32]; P],
+        depth: usize,
+        sums: [[S::V; P]; N],
+    ) -> [[S::V; P]; N] {
+        assert!(panels.iter().all(|w| w.len() == depth * LANES), "the weights are not as deep as the piece");
+        // SAFETY: the caller promises the rows; the panels are `depth` rows of 16.
+        unsafe { s.multiply(left, panels.map(<[f32]>::as_ptr), depth, sums) }
+    }
+}
+
+/// Rows of a left matrix that lie in memory, in one or more pieces of k.
+///
+/// # Safety
+/// [`Left::row`] must be valid for reading [`Left::len`] elements, for every piece and row that exist.
+pub(crate) unsafe trait Left<E> {
+    /// Pieces of each row.
+    fn pieces(&self) -> usize;
+    /// Elements of a piece.
+    fn len(&self, piece: usize) -> usize;
+    /// Where a piece of row `row` of the block starts.
+    fn row(&self, piece: usize, row: usize) -> *const E;
+}
+
+/// What all tiles of a block of rows and k share.
+pub(crate) struct Block<'a, L, T> {
+    pub(crate) left: &'a L,
+    pub(crate) target: &'a T,
+    /// The first row in the whole product.
+    pub(crate) row: usize,
+    /// Output columns of the whole product.
+    pub(crate) columns: usize,
+    /// Whether the chains start in this block of k.
+    pub(crate) first: bool,
+    /// Whether they end in it.
+    pub(crate) last: bool,
+}
+
+/// Some rows of `P` panels.
+pub(crate) struct Tile<'a, A, S, L, T, E, const P: usize>
+where
+    S: Simd,
+    A: Arithmetic<S>,
+    E: Epilogue<S, A>,
+{
+    pub(crate) block: &'a Block<'a, L, T>,
+    pub(crate) arithmetic: PhantomData<A>,
+    pub(crate) epilogue: &'a mut E,
+    /// The panels, as deep as all pieces together.
+    pub(crate) panels: [&'a [A::Right]; P],
+    /// Column of the first panel.
+    pub(crate) column: usize,
+    /// First row in the block.
+    pub(crate) first: usize,
+    /// Where the outputs of each row of the block start in `out`.
+    pub(crate) offsets: &'a [usize],
+    pub(crate) out: &'a mut [E::Out],
+}
+
+impl<A, S, L, T, E, const P: usize> TileRows<S> for Tile<'_, A, S, L, T, E, P>
+where
+    S: Simd,
+    A: Arithmetic<S>,
+    L: Left<A::Left>,
+    T: Target,
+    E: Epilogue<S, A>,
+{
+    #[inline(always)]
+    fn run<const N: usize>(self, s: S) {
+        // A mask that lets everything pass costs nothing, so where there are masks whole columns need no code of their own.
+        if S::MASKED || self.block.columns - self.column < P * LANES {
+            self.rows::<N, false>(s);
+        } else {
+            self.rows::<N, true>(s);
+        }
+    }
+}
+
+impl<A, S, L, T, E, const P: usize> Tile<'_, A, S, L, T, E, P>
+where
+    S: Simd,
+    A: Arithmetic<S>,
+    L: Left<A::Left>,
+    T: Target,
+    E: Epilogue<S, A>,
+{
+    /// `WHOLE` says that all columns exist; else only the last panel lacks some.
+    #[inline(always)]
+    fn rows<const N: usize, const WHOLE: bool>(self, s: S) {
+        let Self { block, epilogue, panels, column, first, offsets, out, .. } = self;
+        let offsets: &[usize; N] = offsets[first..].first_chunk().expect("the block has these rows");
+        let place =
+            |r: usize, j: usize| Place { column: column + j * LANES, row: block.row + first + r, target: block.target };
+        let range = |r: usize, j: usize| {
+            let column = column + j * LANES;
+            let start = offsets[r] + column;
+            start..start + if WHOLE { LANES } else { LANES.min(block.columns - column) }
+        };
+        let mut sums: [[A::Sums; P]; N] = core::array::from_fn(|r| {
+            core::array::from_fn(|j| {
+                let (place, out) = (place(r, j), &out[range(r, j)]);
+                if block.first {
+                    epilogue.start::<T, WHOLE>(s, &place, out)
+                } else {
+                    epilogue.resume::<T, WHOLE>(s, &place, out)
+                }
+            })
+        });
+        let mut k = 0;
+        for piece in 0..block.left.pieces() {
+            let len = block.left.len(piece);
+            let left = core::array::from_fn(|r| block.left.row(piece, first + r));
+            let panels = panels.map(|w| &w[k * LANES..(k + len) * LANES]);
+            // SAFETY: `Left` promises that these pointers are good for `len` elements each.
+            sums = unsafe { A::multiply(s, left, panels, len, sums) };
+            k += len;
+        }
+        for r in 0..N {
+            for j in 0..P {
+                let (place, out) = (place(r, j), &mut out[range(r, j)]);
+                if block.last {
+                    epilogue.finish::<T, WHOLE>(s, &place, sums[r][j], out);
+                } else {
+                    epilogue.pause::<T, WHOLE>(s, &place, sums[r][j], out);
+                }
+            }
+        }
+    }
+}
