@@ -75,6 +75,9 @@ impl Plan {
             len = len.max(at.checked_add(blocks[i].len).ok_or_else(too_large)?);
             placed.push(i);
         }
+        if len > isize::MAX as usize / size_of::<f32>() {
+            return Err(too_large());
+        }
         let mut places = vec![0..0; graph.tensors.len()];
         let mut lines = vec![];
         for (block, &offset) in blocks.iter().zip(&offsets) {
