@@ -103,6 +103,12 @@ import(&checkpoint, &network, Options::default(), Path::new("model.safetensors")
 //!
 //! Without features the library reads models, rigs and `.safetensors` scenes, and runs them.
 
+#[cfg(target_endian = "big")]
+compile_error!(
+    "voxcast uses models and rigs where they are mapped, and their numbers are little-endian: big-endian targets are not \
+     supported"
+);
+
 pub mod base;
 #[cfg(feature = "capi")]
 mod capi;

@@ -14,6 +14,8 @@ use half::f16;
 pub(crate) mod avx2;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx512;
+#[cfg(target_arch = "aarch64")]
+pub(crate) mod neon;
 pub(crate) mod scalar;
 
 /// Lanes of a vector on every instruction set, and columns of a packed weight panel.
@@ -52,6 +54,33 @@ pub(crate) trait Simd: Copy {
 
     /// Calls `body` for as many rows as a tile can have and `left`, which is not 0, allow. Returns how many those were.
     fn rows<B: TileRows<Self>>(self, left: usize, body: B) -> usize;
+
+    /// `sums[r][j] += left[r][k] * panels[j][k]` for k ascending, each a chain of fused multiply-adds.
+    ///
+    /// # Safety
+    /// Each pointer in `left` must be valid for reading `depth` numbers, each in `panels` for `depth` times [`LANES`].
+    #[inline(always)]
+    unsafe fn multiply<const N: usize, const P: usize>(
+        self,
+        left: [*const f32; N],
+        panels: [*const f32; P],
+        depth: usize,
+        mut sums: [[Self::V; P]; N],
+    ) -> [[Self::V; P]; N] {
+        for k in 0..depth {
+            // SAFETY: k < depth, so the caller's promise holds.
+            unsafe {
+                let w = panels.map(|panel| self.load_ptr(panel.add(k * LANES)));
+                for r in 0..N {
+                    let a = self.splat(*left[r].add(k));
+                    for j in 0..P {
+                        sums[r][j] = self.mul_add(a, w[j], sums[r][j]);
+                    }
+                }
+            }
+        }
+        sums
+    }
 
     /// All lanes `x`.
     fn splat(self, x: f32) -> Self::V;

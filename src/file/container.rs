@@ -447,7 +447,7 @@ mod tests {
 
     #[test]
     fn hostile_headers_are_refused() {
-        let half = 1usize << 60;
+        let half = 1usize << (usize::BITS - 4);
         let huge: Vec<String> = (0..16)
             .map(|i: usize| {
                 let end = if i == 15 { usize::MAX } else { (i + 1) * half };

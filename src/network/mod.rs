@@ -94,8 +94,8 @@ fn default_cameras() -> usize {
 pub const BUILT_IN: [&str; 4] = ["nuscenes-200", "nuscenes-256", "semantickitti-256", "edge"];
 
 /// No dimension of a network may exceed this: with [`MAX_VOXELS`] it keeps every size that is computed from them within
-/// 64 bits.
-const MAX_DIM: usize = 1 << 16;
+/// a `usize`. The largest are the weights of a 3x3 convolution of the last stage: 9 times the square of 8 widths.
+const MAX_DIM: usize = if usize::BITS < 64 { 1 << 10 } else { 1 << 16 };
 
 /// Blocks that a backbone stage may have; the deepest ResNet published has 48 in one. A graph has some ten operations per
 /// block, and planning looks at pairs of them.
@@ -105,7 +105,7 @@ const MAX_DEPTH: usize = 256;
 pub const MAX_SIDE: usize = 16_384;
 
 /// Voxels that the output may have. `nuscenes-256` has 2^21.
-const MAX_VOXELS: u64 = 1 << 32;
+const MAX_VOXELS: u64 = if usize::BITS < 64 { 1 << 27 } else { 1 << 32 };
 
 /// Attention heads of the EfficientViT block; fixed by the published architecture.
 pub const HEADS: usize = 8;
@@ -190,13 +190,12 @@ impl Network {
             ("fpn", &[self.fpn]),
             ("channels", &self.channels),
             ("key_dims", &self.key_dims),
-            ("image", &self.image),
             ("samples", &self.samples),
             ("cameras", &[self.cameras]),
             ("grids", self.grids.as_flattened()),
         ] {
             if !values.iter().all(|&v| ranged(v)) {
-                return bad(key, format!("{values:?}"), "values from 1 to 65536");
+                return bad(key, format!("{values:?}"), &format!("values from 1 to {MAX_DIM}"));
             }
         }
         if !(2..=256).contains(&self.classes) {
@@ -212,7 +211,7 @@ impl Network {
         if self.depths.iter().any(|&v| v > MAX_DEPTH) {
             return bad("depths", format!("{:?}", self.depths), "values from 1 to 256");
         }
-        if self.image.iter().any(|&v| v % 32 != 0 || v > MAX_SIDE) {
+        if self.image.iter().any(|&v| v == 0 || v % 32 != 0 || v > MAX_SIDE) {
             return bad(
                 "image",
                 format!("{:?}", self.image),

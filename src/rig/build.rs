@@ -334,7 +334,7 @@ fn check_size(network: &Network, level: usize, cameras: usize) -> Result<()> {
         ("voxels", voxels, MAX_ROWS),
         ("sample points in all cameras", projections, MAX_PROJECTIONS),
         ("sample points of a column in all cameras", column, MAX_COLUMN),
-        ("feature pixels of all cameras", pixels, 1 << 32),
+        ("feature pixels of all cameras", pixels, (1 << 32).min(usize::MAX as u128)),
     ] {
         if found > most {
             let message = format!("level {}: {found} {what}, at most {most} are supported", level + 1);

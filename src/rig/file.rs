@@ -52,7 +52,7 @@ impl Rig {
     pub fn from_container(container: Container, network: &Network, cameras: usize) -> Result<Rig> {
         let calibration = check_metadata(container.metadata(), network, cameras)?;
         let mut ranges = Tensors::<Range<usize>>::default();
-        let mut in_place = cfg!(target_endian = "little");
+        let mut in_place = true;
         for l in 0..3 {
             let pixels = network.feature_pixels(l) as u64 * cameras as u64;
             let [x, y, z] = network.grids[l];
@@ -92,11 +92,7 @@ impl Rig {
                 check_rows(&format!("level{}.{which}.ptr", l + 1), csr.ptr.len(), rows).map_err(|e| e.in_file(path))?;
             }
             for (name, words) in NAMES.iter().zip([level.volume.ptr, level.volume.col, level.bev.ptr, level.bev.col]) {
-                let data = if cfg!(target_endian = "little") {
-                    Data::Bytes(bytemuck::cast_slice(words))
-                } else {
-                    Data::Make(Box::new(move || Ok(words.iter().flat_map(|w| w.to_le_bytes()).collect())))
-                };
+                let data = Data::Bytes(bytemuck::cast_slice(words));
                 let name = format!("level{}.{name}", l + 1);
                 tensors.push(Tensor { name, dtype: Dtype::U32, shape: vec![words.len()], data });
             }
@@ -161,11 +157,11 @@ fn tensor<'a>(container: &'a Container, name: &str) -> Result<&'a [u8]> {
     Ok(bytes)
 }
 
-/// Little-endian bytes as numbers: in place if alignment and byte order allow.
+/// Little-endian bytes as numbers: in place if they are aligned.
 fn as_words(bytes: &[u8]) -> Cow<'_, [u32]> {
     match bytemuck::try_cast_slice(bytes) {
-        Ok(words) if cfg!(target_endian = "little") => Cow::Borrowed(words),
-        _ => bytes.as_chunks().0.iter().map(|&b| u32::from_le_bytes(b)).collect(),
+        Ok(words) => Cow::Borrowed(words),
+        Err(_) => bytes.as_chunks().0.iter().map(|&b| u32::from_le_bytes(b)).collect(),
     }
 }
 

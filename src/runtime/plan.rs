@@ -100,6 +100,10 @@ impl Plan {
             plan.lines.push(Line { name: block.name, place, life: block.life });
         }
         plan.outside(graph, cameras, everything)?;
+        // More cannot be one allocation, which on 32 bits is soon reached.
+        if [plan.arena, plan.input, plan.output].into_iter().any(|bytes| bytes > isize::MAX as usize) {
+            return Err(too_large());
+        }
         Ok(plan)
     }
 

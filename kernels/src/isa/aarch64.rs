@@ -1,7 +1,7 @@
 //! The token of AArch64.
 
 use super::has;
-use crate::simd::{Kernel, scalar};
+use crate::simd::{Kernel, neon};
 
 /// Proof that this CPU has Advanced SIMD (NEON), and of what more it has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,9 +45,9 @@ impl Neon {
         }
     }
 
-    /// The specification: there are no vector bodies for AArch64.
     #[inline(always)]
     pub(crate) fn run<K: Kernel>(self, kernel: K) -> K::Output {
-        scalar::run(kernel)
+        // SAFETY: the token proves that this CPU has NEON.
+        unsafe { neon::run(self, kernel) }
     }
 }

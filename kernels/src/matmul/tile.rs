@@ -45,26 +45,11 @@ impl<S: Simd> Arithmetic<S> for Single {
         left: [*const f32; N],
         panels: [&[f32]; P],
         depth: usize,
-        mut sums: [[S::V; P]; N],
+        sums: [[S::V; P]; N],
     ) -> [[S::V; P]; N] {
         assert!(panels.iter().all(|w| w.len() == depth * LANES), "the weights are not as deep as the piece");
-        let panels = panels.map(|w| w.as_ptr());
-        for k in 0..depth {
-            // SAFETY: k < depth, within the panels and, as the caller promises, within every row's piece.
-            unsafe {
-                let mut w = [s.splat(0.0); P];
-                for j in 0..P {
-                    w[j] = s.load_ptr(panels[j].add(k * LANES));
-                }
-                for r in 0..N {
-                    let a = s.splat(*left[r].add(k));
-                    for j in 0..P {
-                        sums[r][j] = s.mul_add(a, w[j], sums[r][j]);
-                    }
-                }
-            }
-        }
-        sums
+        // SAFETY: the caller promises the rows; the panels are `depth` rows of 16.
+        unsafe { s.multiply(left, panels.map(<[f32]>::as_ptr), depth, sums) }
     }
 }
 

@@ -149,20 +149,34 @@ impl Depthwise<'_> {
             let x = &self.input[at..at + lanes];
             if WHOLE { s.load(x.first_chunk().expect("16 channels")) } else { s.load_part(x) }
         };
+        let weights = |ky: usize, kx: usize| {
+            let w = &self.weights[(ky * self.kernel + kx) * padded + c..];
+            s.load(w.first_chunk().expect("padded channels"))
+        };
         let mut sums = [s.load(self.bias[c..].first_chunk().expect("padded channels")); N];
         for ky in 0..self.kernel {
+            // Where no tap leaves the row, all of a row of taps are one piece of memory.
+            let piece = if N > 1 { self.offset(y + ky, x) } else { None };
+            let piece = piece.map(|at| &self.input[at + c..][..(N + self.kernel - 2) * self.channels + lanes]);
             for kx in 0..self.kernel {
-                let w = &self.weights[(ky * self.kernel + kx) * padded + c..];
-                let w = s.load(w.first_chunk().expect("padded channels"));
-                match self.offset(y + ky, x + kx) {
-                    Some(at) => {
+                let w = weights(ky, kx);
+                match piece {
+                    Some(piece) => {
                         for (i, sum) in sums.iter_mut().enumerate() {
-                            *sum = s.mul_add(load(at + i * self.channels + c), w, *sum);
+                            let at = (kx + i) * self.channels;
+                            let x = if WHOLE {
+                                // SAFETY: kx < kernel and i < N, so these 16 numbers end where the piece does, at most.
+                                unsafe { s.load_ptr(piece.as_ptr().add(at)) }
+                            } else {
+                                s.load_part(&piece[at..][..lanes])
+                            };
+                            *sum = s.mul_add(x, w, *sum);
                         }
                     }
                     None => {
-                        for sum in &mut sums {
-                            *sum = s.mul_add(s.splat(0.0), w, *sum);
+                        for (i, sum) in sums.iter_mut().enumerate() {
+                            let x = self.offset(y + ky, x + i + kx).map_or(s.splat(0.0), |at| load(at + c));
+                            *sum = s.mul_add(x, w, *sum);
                         }
                     }
                 }

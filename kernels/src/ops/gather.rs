@@ -8,13 +8,13 @@
 //! A [`Mask`] leaves out the pixels of some cameras: sum and count are then those of a matrix without their entries.
 //!
 //! Channels are the vector axis: a feature pixel is one contiguous piece of memory, and a row's sum stays in registers
-//! while its pixels stream by.
+//! while its pixels stream by. That all pixels of a row exist is checked before, so that nothing else is done meanwhile.
 
 use crate::isa::Isa;
 use crate::simd::{Kernel, LANES, Simd, dispatch, relu};
 use core::ops::Range;
 
-/// Vectors summed at once: 64 channels, eight AVX2 registers.
+/// Vectors summed at once: 64 channels, eight AVX2 registers, sixteen of NEON.
 const VECTORS: usize = 4;
 
 /// Cameras whose pixels count as if the matrix did not name them.
@@ -108,6 +108,7 @@ pub struct Gather<'a> {
 pub fn gather(isa: Isa, args: &Gather<'_>, rows: Range<usize>, out: &mut [f32]) {
     let behind = args.stride.checked_sub(args.first_channel);
     assert!(behind.is_some_and(|c| c >= args.channels), "channels out of range");
+    assert!(u32::try_from(args.stride).is_ok(), "the stride is out of range");
     let total = args.ptr.len().saturating_sub(1);
     assert!(rows.start <= rows.end && rows.end <= total, "rows {rows:?} of {total}");
     assert_eq!(out.len(), rows.len() * args.channels, "the output does not hold the rows");
@@ -126,9 +127,24 @@ impl Gather<'_> {
         Kept { mask: self.mask, rest: &self.col[self.ptr[row] as usize..self.ptr[row + 1] as usize] }
     }
 
+    /// Where gathered channel `channel` of pixel `col` is among the features. An offset that no slice has where this is
+    /// beyond the address space; 64 bits hold it, because neither a pixel nor the stride exceeds 32.
     #[inline(always)]
-    fn pixel(&self, col: u32, channel: usize, len: usize) -> &[f32] {
-        &self.features[col as usize * self.stride + self.first_channel + channel..][..len]
+    fn offset(&self, col: u32, channel: usize) -> usize {
+        let offset = u64::from(col) * self.stride as u64 + (self.first_channel + channel) as u64;
+        usize::try_from(offset).unwrap_or(usize::MAX)
+    }
+
+    /// Checks that the pixels `cols` exist.
+    ///
+    /// # Panics
+    /// If one does not.
+    #[inline(always)]
+    fn check_pixels(&self, cols: &[u32]) {
+        if let Some(last) = cols.iter().copied().max() {
+            let end = self.offset(last, 0).saturating_add(self.channels);
+            assert!(end <= self.features.len(), "pixel {last} is out of range");
+        }
     }
 }
 
@@ -142,7 +158,7 @@ impl Kernel for Run<'_> {
             for (c, out) in out.iter_mut().enumerate() {
                 let mut sum = 0.0;
                 for &col in a.row(row).flatten() {
-                    sum += a.pixel(col, c, 1)[0];
+                    sum += a.features[a.offset(col, c)];
                 }
                 *out = sum / a.row(row).columns().max(1) as f32;
                 if let Some(bias) = a.bias {
@@ -160,6 +176,7 @@ impl Kernel for Run<'_> {
         let a = self.args;
         for (row, out) in self.rows.zip(self.out.chunks_exact_mut(a.channels.max(1))) {
             let row = a.row(row);
+            row.clone().for_each(|cols| a.check_pixels(cols));
             let count = s.splat(row.clone().columns().max(1) as f32);
             let mut channel = 0;
             while channel < a.channels {
@@ -169,9 +186,12 @@ impl Kernel for Run<'_> {
                     let mut sums = [s.splat(0.0); VECTORS];
                     for cols in row.clone() {
                         for &col in cols {
-                            let (pixel, _) = a.pixel(col, channel, VECTORS * LANES).as_chunks();
                             for v in 0..VECTORS {
-                                sums[v] = s.add(sums[v], s.load(&pixel[v]));
+                                // SAFETY: this pixel exists, and with it all channels that are gathered, of which
+                                // these are some.
+                                let x =
+                                    unsafe { s.load_ptr(a.features.as_ptr().add(a.offset(col, channel + v * LANES))) };
+                                sums[v] = s.add(sums[v], x);
                             }
                         }
                     }
@@ -185,7 +205,7 @@ impl Kernel for Run<'_> {
                     let mut sum = s.splat(0.0);
                     for cols in row.clone() {
                         for &col in cols {
-                            sum = s.add(sum, s.load_part(a.pixel(col, channel, width)));
+                            sum = s.add(sum, s.load_part(&a.features[a.offset(col, channel)..][..width]));
                         }
                     }
                     finish(s, a, channel, count, sum, &mut out[..width]);
@@ -542,6 +562,33 @@ mod tests {
     #[should_panic(expected = "out of range")]
     fn a_pixel_that_is_not_there_for_the_scalar_code() {
         broken(Isa::Scalar, |case| case.col[4] = u32::MAX);
+    }
+
+    #[test]
+    #[should_panic(expected = "out of range")]
+    fn a_pixel_whose_place_wraps() {
+        // In 32 bits `col * stride` would be 0, a pixel that exists.
+        let features = [1.0; 64];
+        let mut out = [0.0; 64];
+        let args = Gather {
+            ptr: &[0, 1],
+            col: &[1 << 26],
+            mask: None,
+            features: &features,
+            stride: 64,
+            first_channel: 0,
+            channels: 64,
+            bias: None,
+            relu: false,
+        };
+        gather(Isa::best(), &args, 0..1, &mut out);
+    }
+
+    #[test]
+    #[should_panic(expected = "the stride is out of range")]
+    #[cfg(target_pointer_width = "64")]
+    fn a_stride_that_no_features_have() {
+        broken(Isa::best(), |case| case.stride = 1 << 32);
     }
 
     #[test]

@@ -1,0 +1,222 @@
+//! NEON: a vector is four 4-lane registers.
+//!
+//! Where an instruction has no intrinsic in the oldest compiler that this crate supports, it is written as assembly.
+
+use super::{Kernel, LANES, Simd, Tile, TileRows};
+use crate::isa::Neon;
+use core::arch::aarch64::*;
+use core::arch::asm;
+use half::f16;
+
+/// Lanes of a register.
+const QUARTER: usize = 4;
+
+/// Instantiates `kernel`'s body with the instructions enabled.
+///
+/// # Safety
+/// The CPU must have NEON, which a [`Neon`] token proves.
+#[target_feature(enable = "neon")]
+pub(crate) unsafe fn run<K: Kernel>(token: Neon, kernel: K) -> K::Output {
+    kernel.run(token)
+}
+
+/// Applies a lane-wise intrinsic to all four quarters.
+macro_rules! quarters {
+    ($op:ident($($x:expr),*)) => {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe { [$op($($x[0]),*), $op($($x[1]),*), $op($($x[2]),*), $op($($x[3]),*)] }
+    };
+}
+
+/// The mask's choice of two vectors.
+macro_rules! select {
+    ($mask:expr, $a:expr, $b:expr) => {{
+        let mask = $mask;
+        quarters!(vbslq_f32(mask, $a, $b))
+    }};
+}
+
+impl Simd for Neon {
+    type V = [float32x4_t; 4];
+    type I = [uint32x4_t; 4];
+    type M = [uint32x4_t; 4];
+    // 24 accumulators of 4 lanes, a register of four k of each row, and 2 of weights fill the 32 registers.
+    const TILE: Tile = Tile { rows: 6, panels: 1 };
+    const MASKED: bool = false;
+
+    #[inline(always)]
+    fn rows<B: TileRows<Self>>(self, left: usize, body: B) -> usize {
+        match left {
+            6.. => body.run::<6>(self),
+            5 => body.run::<5>(self),
+            4 => body.run::<4>(self),
+            3 => body.run::<3>(self),
+            2 => body.run::<2>(self),
+            _ => body.run::<1>(self),
+        }
+        left.min(6)
+    }
+
+    /// Four k of a row are loaded at once and multiplied by lane: a load that fills all lanes with one number takes a slot
+    /// of the multipliers on many cores, and there are four times as many of them.
+    #[inline(always)]
+    unsafe fn multiply<const N: usize, const P: usize>(
+        self,
+        left: [*const f32; N],
+        panels: [*const f32; P],
+        depth: usize,
+        mut sums: [[Self::V; P]; N],
+    ) -> [[Self::V; P]; N] {
+        /// `sums += left[.][LANE] * w` for the registers `q` of the panels `j`.
+        macro_rules! step {
+            ($lane:literal, $a:ident, $k:expr) => {
+                for j in 0..P {
+                    for q in 0..QUARTER {
+                        let w = vld1q_f32(panels[j].add(($k + $lane) * LANES + q * QUARTER));
+                        for r in 0..N {
+                            sums[r][j][q] = vfmaq_laneq_f32::<$lane>(sums[r][j][q], w, $a[r]);
+                        }
+                    }
+                }
+            };
+        }
+        let whole = depth / QUARTER * QUARTER;
+        // SAFETY: every k is below `depth`, so the caller's promise holds for all loads; the token proves NEON.
+        unsafe {
+            for k in (0..whole).step_by(QUARTER) {
+                let a = left.map(|left| vld1q_f32(left.add(k)));
+                step!(0, a, k);
+                step!(1, a, k);
+                step!(2, a, k);
+                step!(3, a, k);
+            }
+            for k in whole..depth {
+                let a = left.map(|left| vld1q_dup_f32(left.add(k)));
+                step!(0, a, k);
+            }
+        }
+        sums
+    }
+
+    #[inline(always)]
+    fn splat(self, x: f32) -> Self::V {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe { [vdupq_n_f32(x); 4] }
+    }
+    #[inline(always)]
+    unsafe fn load_ptr(self, p: *const f32) -> Self::V {
+        // SAFETY: the caller promises 16 readable f32 at `p`; the token proves NEON.
+        unsafe { [0, 1, 2, 3].map(|q| vld1q_f32(p.add(q * QUARTER))) }
+    }
+    #[inline(always)]
+    unsafe fn store_ptr(self, p: *mut f32, v: Self::V) {
+        for q in 0..4 {
+            // SAFETY: the caller promises 16 writable f32 at `p`; the token proves NEON.
+            unsafe { vst1q_f32(p.add(q * QUARTER), v[q]) }
+        }
+    }
+    #[inline(always)]
+    fn widen(self, x: &[f16; LANES]) -> Self::V {
+        let p = x.as_ptr().cast::<u16>();
+        // SAFETY: the array is 32 bytes, read as two unaligned 16-byte halves; the token proves NEON, of which `fcvtl` is a
+        // part. Intrinsics for it, and the type of four half-precision numbers, came with Rust 1.94.
+        unsafe {
+            let halves = [vld1q_u16(p), vld1q_u16(p.add(8))];
+            let mut out = self.splat(0.0);
+            for (h, half) in halves.into_iter().enumerate() {
+                let (low, high);
+                asm!("fcvtl {:v}.4s, {:v}.4h", lateout(vreg) low, in(vreg) half, options(pure, nomem, nostack, preserves_flags));
+                asm!("fcvtl2 {:v}.4s, {:v}.8h", lateout(vreg) high, in(vreg) half, options(pure, nomem, nostack, preserves_flags));
+                (out[2 * h], out[2 * h + 1]) = (low, high);
+            }
+            out
+        }
+    }
+    #[inline(always)]
+    fn add(self, a: Self::V, b: Self::V) -> Self::V {
+        quarters!(vaddq_f32(a, b))
+    }
+    #[inline(always)]
+    fn sub(self, a: Self::V, b: Self::V) -> Self::V {
+        quarters!(vsubq_f32(a, b))
+    }
+    #[inline(always)]
+    fn mul(self, a: Self::V, b: Self::V) -> Self::V {
+        quarters!(vmulq_f32(a, b))
+    }
+    #[inline(always)]
+    fn div(self, a: Self::V, b: Self::V) -> Self::V {
+        quarters!(vdivq_f32(a, b))
+    }
+    #[inline(always)]
+    fn mul_add(self, a: Self::V, b: Self::V, c: Self::V) -> Self::V {
+        quarters!(vfmaq_f32(c, a, b))
+    }
+    // Not `fmax` and `fmin`: they give NaN where either operand is NaN, and order the zeros.
+    #[inline(always)]
+    fn max(self, a: Self::V, b: Self::V) -> Self::V {
+        select!(quarters!(vcgtq_f32(a, b)), a, b)
+    }
+    #[inline(always)]
+    fn min(self, a: Self::V, b: Self::V) -> Self::V {
+        select!(quarters!(vcltq_f32(a, b)), a, b)
+    }
+    #[inline(always)]
+    fn round(self, a: Self::V) -> Self::V {
+        quarters!(vrndnq_f32(a))
+    }
+    #[inline(always)]
+    fn exp2_int(self, n: Self::V) -> Self::V {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        n.map(|n| unsafe {
+            let biased = vaddq_s32(vcvtq_s32_f32(n), vdupq_n_s32(127));
+            vreinterpretq_f32_s32(vshlq_n_s32::<23>(biased))
+        })
+    }
+    #[inline(always)]
+    fn splat_int(self, x: u32) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe { [vdupq_n_u32(x); 4] }
+    }
+    #[inline(always)]
+    fn truncate(self, a: Self::V) -> Self::I {
+        quarters!(vcvtq_u32_f32(a))
+    }
+    #[inline(always)]
+    fn shift_right(self, a: Self::I, bits: u32) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has NEON, whose left shift by a negative number is one to the right.
+        a.map(|a| unsafe { vshlq_u32(a, vdupq_n_s32(-bits.cast_signed())) })
+    }
+    #[inline(always)]
+    fn add_int(self, a: Self::I, b: Self::I) -> Self::I {
+        quarters!(vaddq_u32(a, b))
+    }
+    #[inline(always)]
+    fn mul_int(self, a: Self::I, b: Self::I) -> Self::I {
+        quarters!(vmulq_u32(a, b))
+    }
+    #[inline(always)]
+    fn keep(self, mask: Self::M, a: Self::I) -> Self::I {
+        quarters!(vandq_u32(mask, a))
+    }
+    #[inline(always)]
+    fn store_int(self, x: &mut [u32; LANES], v: Self::I) {
+        for (x, v) in x.as_chunks_mut::<QUARTER>().0.iter_mut().zip(v) {
+            // SAFETY: the chunk holds the 4 lanes; the token proves NEON.
+            unsafe { vst1q_u32(x.as_mut_ptr(), v) }
+        }
+    }
+    #[inline(always)]
+    fn at_least(self, a: Self::V, b: Self::V) -> Self::M {
+        quarters!(vcgeq_f32(a, b))
+    }
+    #[inline(always)]
+    fn both(self, a: Self::M, b: Self::M) -> Self::M {
+        quarters!(vandq_u32(a, b))
+    }
+    #[inline(always)]
+    fn prefetch<T>(self, p: *const T) {
+        // SAFETY: a prefetch is a hint that never faults. The compiler has no stable intrinsic for it.
+        unsafe { asm!("prfm pldl1keep, [{}]", in(reg) p, options(readonly, nostack, preserves_flags)) }
+    }
+}
