@@ -1,7 +1,7 @@
 //! The fast builder against a naive one, and the file format against damage.
 
 use super::*;
-use crate::base::error::{Error, ErrorKind};
+use crate::base::error::ErrorKind;
 use crate::base::threads::Threads;
 use crate::file::container::{self, Data, Layout, Tensor};
 use crate::network::{Network, Sampling};
