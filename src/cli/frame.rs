@@ -172,7 +172,7 @@ pub fn read(path: &Path, network: &Network) -> Result<(Scene, Vec<Note>)> {
     scene.check(network).map_err(|e| e.in_file(path))?;
     let (cameras, expected) = (scene.cameras(), network.cameras);
     if cameras != expected {
-        let message = format!("{cameras} cameras, the network was trained for {expected}");
+        let message = format!("its number of cameras is {cameras}, the network was trained for {expected}");
         notes.push(Note::new(message).in_file(path));
     }
     Ok((scene, notes))

@@ -61,7 +61,8 @@ fn rigs_that_do_not_belong_here() {
         [&(header.len() as u64).to_le_bytes()[..], header.as_bytes(), &data].concat()
     };
     fs::write(&bad, plain("", &|_| ())).unwrap();
-    done(&words(&place.run("model", "bad", "scene")));
+    let output = voxcast(&words(&place.run("model", "bad", "scene")));
+    assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
     type Edit<'a> = &'a dyn Fn(&mut Vec<u32>);
     let cases: [(&str, Edit<'_>, &str); 7] = [
         ("level1.volume.col", &|w| *w.last_mut().unwrap() = u32::MAX, "4294967295"),

@@ -82,7 +82,7 @@ impl Checkpoint {
     /// The file must not change while the checkpoint lives: the tensors are views of it.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] where the file cannot be opened or mapped, else as [`Checkpoint::from_bytes`].
+    /// [`ErrorKind::Io`](crate::ErrorKind::Io) where the file cannot be opened or mapped, else as [`Checkpoint::from_bytes`].
     pub fn open(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
         let io = |doing| move |e: std::io::Error| Error::io(path, doing, &e);
