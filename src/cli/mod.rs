@@ -114,7 +114,7 @@ impl ThreadCount {
 pub struct Machine {
     #[command(flatten)]
     threads: ThreadCount,
-    /// Instruction set: scalar (the specification, and slow), avx2, avx512 [default: the fastest of this CPU]
+    /// Instruction set: scalar (the specification, and slow), avx2, avx512, neon [default: the fastest of this CPU]
     #[arg(long, value_name = "NAME")]
     isa: Option<String>,
 }
