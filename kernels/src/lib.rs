@@ -11,6 +11,10 @@
 //!
 //! Without the default feature `std` the crate needs `core` alone.
 #![cfg_attr(not(any(test, feature = "std")), no_std)]
+#![cfg_attr(
+    not(any(target_arch = "x86_64", target_arch = "aarch64")),
+    allow(dead_code, reason = "without vector instructions only the specification runs")
+)]
 
 #[cfg(feature = "cases")]
 pub mod cases;

@@ -155,12 +155,14 @@ impl Kernel for Run<'_> {
     fn reference(self) {
         let a = self.args;
         for (row, out) in self.rows.zip(self.out.chunks_exact_mut(a.channels.max(1))) {
+            let row = a.row(row);
+            row.clone().for_each(|cols| a.check_pixels(cols));
             for (c, out) in out.iter_mut().enumerate() {
                 let mut sum = 0.0;
-                for &col in a.row(row).flatten() {
+                for &col in row.clone().flatten() {
                     sum += a.features[a.offset(col, c)];
                 }
-                *out = sum / a.row(row).columns().max(1) as f32;
+                *out = sum / row.clone().columns().max(1) as f32;
                 if let Some(bias) = a.bias {
                     *out += bias[c];
                 }
