@@ -5,7 +5,7 @@ fn tensors(images: (Dtype, &[usize]), matrices: (Dtype, &[usize]), first: f32) -
     let size = |(dtype, shape): (Dtype, &[usize])| shape.iter().product::<usize>() * dtype.bitsize() / 8;
     let pixels: Vec<u8> = (0..size(images)).map(|i| i as u8).collect();
     // Unit matrices, but for the first element.
-    let unit = |i: usize| if i == 0 { first } else { f32::from(u8::from(i % 16 % 5 == 0)) };
+    let unit = |i: usize| if i == 0 { first } else { f32::from(u8::from((i % 16).is_multiple_of(5))) };
     let mut entries: Vec<u8> = (0..size(matrices) / 4).flat_map(|i| unit(i).to_le_bytes()).collect();
     entries.resize(size(matrices), 0);
     let views = [

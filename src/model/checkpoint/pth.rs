@@ -110,8 +110,11 @@ fn check_kind(archive: &mut Archive<'_>, folder: &str) -> Result<()> {
 const STATE_DICTS: [&str; 8] =
     ["state_dict", "model_state_dict", "model", "module", "net", "ema_state_dict", "state_dict_ema", "model_ema"];
 
-/// The dict of tensors, and what is to be said of its choice: under a key of [`STATE_DICTS`] at the top, or the top itself.
-fn state_dict<'p>(pickle: &'p Pickle<'_>) -> Result<(&'p [(Id, Id)], Vec<String>)> {
+/// The entries of a dict, and what is to be said of its choice.
+type Chosen<'p> = (&'p [(Id, Id)], Vec<String>);
+
+/// The dict of tensors: under a key of [`STATE_DICTS`] at the top, or the top itself.
+fn state_dict<'p>(pickle: &'p Pickle<'_>) -> Result<Chosen<'p>> {
     let Value::Dict(top) = pickle.root() else {
         return Err(Error::format(format!("the checkpoint is {}, expected a dict", pickle.root().kind())));
     };
