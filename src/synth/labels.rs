@@ -3,7 +3,7 @@
 use super::camera::Pinhole;
 use super::objects::class;
 use super::render::CameraView;
-use super::solid::Object;
+use super::solid::{Object, Part};
 use super::world::World;
 use crate::network::Network;
 use glam::{Vec2, Vec3};
@@ -145,11 +145,18 @@ fn fill(world: &World, grid: &Grid, object: &Object, fills: &mut Vec<Fill>) {
         let at = |v: f32| ((v - grid.low[axis]) / step[axis]).clamp(0.0, points[axis] as f32) as usize;
         at(near[axis])..at(far[axis])
     };
+    let mut here: Vec<&Part> = Vec::with_capacity(object.parts.len());
     for x in range(0) {
         for y in range(1) {
             let at = |z: usize| grid.low + (Vec3::new(x as f32, y as f32, z as f32) + 0.5) * step;
             // Along a column only the height changes.
             let base = object.inwards(world.placed(grid.vehicle(at(0))) - object.at);
+            let beside = |p: &Part| ((base - p.centre).abs() - p.half).truncate().max_element() > thick;
+            here.clear();
+            here.extend(object.parts.iter().filter(|p| !beside(p)));
+            if here.is_empty() {
+                continue;
+            }
             let (mut last, mut count) = (nz, 0);
             let mut close = |z: usize, count: u16| {
                 if count > 0 {
@@ -163,15 +170,15 @@ fn fill(world: &World, grid: &Grid, object: &Object, fills: &mut Vec<Fill>) {
                     (last, count) = (z / POINTS, 0);
                 }
                 let point = base + Vec3::Z * (z as f32 * step.z);
-                count += u16::from(object.parts.iter().any(|p| p.contains(point, thick)));
+                count += u16::from(here.iter().any(|p| p.contains(point, thick)));
             }
             close(last, count);
         }
     }
 }
 
-/// Rays that are followed together.
-const LANES: usize = 8;
+/// Rays that are followed together: two vectors' worth, since each step waits for the one before.
+const LANES: usize = 16;
 
 /// Per voxel whether a camera sees it: whether the ray of one of its pixels goes through it or ends on it.
 pub(super) fn visible(grid: &Grid, cameras: &[Pinhole], views: &[CameraView]) -> Vec<u8> {
