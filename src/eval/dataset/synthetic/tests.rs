@@ -12,9 +12,8 @@ fn network() -> Network {
 /// Writes a frame without the program that usually does.
 fn save(directory: &Path, seed: u64, labels: Vec<u8>, visible: &[u8]) {
     let images: Vec<u8> = (0..2 * 32 * 32 * 3).map(|i| (i * 7 + seed as usize) as u8).collect();
-    // Two matrices that count up to their last rows, which are those of any.
-    let matrix = |first: u16| (first..first + 12).map(f32::from).chain([0.0, 0.0, 0.0, 1.0]);
-    let matrices: Vec<u8> = matrix(0).chain(matrix(16)).flat_map(f32::to_le_bytes).collect();
+    let matrix = |shift: f32| [1.0, 0.0, 0.0, shift, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0f32];
+    let matrices: Vec<u8> = [matrix(3.0), matrix(19.0)].as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect();
     let tensor = |name: &str, dtype, shape: &[usize], bytes: Vec<u8>| Tensor {
         name: name.to_owned(),
         dtype,
