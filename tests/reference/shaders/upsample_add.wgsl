@@ -13,6 +13,6 @@ fn main(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups) n
     let at_x = i % s.width;
     let at_y = i / s.width % s.height;
     let c = i / (s.width * s.height);
-    let from = (c * s.low_height + at_y * s.low_height / s.height) * s.low_width + at_x * s.low_width / s.width;
-    out[i] = x[i] + low[from];
+    let source = (c * s.low_height + at_y * s.low_height / s.height) * s.low_width + at_x * s.low_width / s.width;
+    out[i] = x[i] + low[source];
 }
