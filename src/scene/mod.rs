@@ -1,6 +1,9 @@
 //! A scene: one set of camera images with their calibration.
 
 pub mod camera;
+mod stamps;
+
+pub use stamps::read_stamps;
 
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::network::Network;
@@ -165,6 +168,15 @@ impl Scene {
     /// images and matrices differ or an image has not the bytes that its size says.
     #[cfg(feature = "images")]
     pub fn save(&self, directory: &Path) -> Result<()> {
+        self.save_stamped(directory, None)
+    }
+
+    /// [`Scene::save`] of images that were all taken at `stamp`, in nanoseconds; [`read_stamps`] finds it again.
+    ///
+    /// # Errors
+    /// As [`Scene::save`].
+    #[cfg(feature = "images")]
+    pub fn save_stamped(&self, directory: &Path, stamp: Option<u64>) -> Result<()> {
         if self.names.len() != self.images.len() || self.lidar2img.len() != self.images.len() {
             let (names, images, matrices) = (self.names.len(), self.images.len(), self.lidar2img.len());
             let message =
@@ -193,9 +205,13 @@ impl Scene {
             rgb.chunks_exact_mut(3).for_each(|p| p.swap(0, 2));
             crate::show::picture::write_rgb_png(&path, image.width, image.height, &rgb)?;
             let matrix: Vec<&[f32]> = self.lidar2img[index].chunks(4).collect();
-            cameras.push(serde_json::json!({
+            let mut camera = serde_json::json!({
                 "name": name, "file": file, "width": image.width, "height": image.height, "lidar2img": matrix,
-            }));
+            });
+            if let Some(stamp) = stamp {
+                camera["stamp"] = stamp.into();
+            }
+            cameras.push(camera);
         }
         let mut text = serde_json::json!({ "cameras": cameras }).to_string();
         text.push('\n');
@@ -280,29 +296,51 @@ fn read_image(path: &Path, _camera: &str, _size: Option<[usize; 2]>) -> Result<I
 /// from the caller, and its name, [`DECODER_THREAD`], tells a panic hook whose panic it is.
 #[cfg(feature = "images")]
 pub(crate) fn read_image(path: &Path, name: &str, size: Option<[usize; 2]>) -> Result<Image> {
+    on_decoder_thread(name, || decode_image(path, name, size)).map_err(|e| e.in_file(path))
+}
+
+/// Decodes the image file of camera `name` that is in memory, as [`read_image`] does.
+#[cfg(feature = "mcap")]
+pub(crate) fn decode_image_bytes(bytes: &[u8], name: &str, size: Option<[usize; 2]>) -> Result<Image> {
+    on_decoder_thread(name, || decode(std::io::Cursor::new(bytes), bytes.len() as u64, name, size))
+}
+
+#[cfg(feature = "images")]
+fn on_decoder_thread(name: &str, decode: impl FnOnce() -> Result<Image> + Send) -> Result<Image> {
     std::thread::scope(|scope| {
         let builder = std::thread::Builder::new().name(DECODER_THREAD.into());
-        let thread = builder.spawn_scoped(scope, || decode_image(path, name, size));
-        let thread = thread.map_err(|e| Error::io(path, "start a thread to decode", &e))?;
-        let panicked = |_| Error::format(format!("image of camera {name}: its decoder gave up")).in_file(path);
-        thread.join().map_err(panicked)?
+        let thread = builder.spawn_scoped(scope, decode);
+        let thread = thread.map_err(|e| Error::new(ErrorKind::Io, format!("cannot start a thread to decode: {e}")))?;
+        thread.join().map_err(|_| Error::format(format!("image of camera {name}: its decoder gave up")))?
     })
 }
 
-/// Decodes an image, after its header has passed every check on size.
+/// Opens and decodes an image.
 #[cfg(feature = "images")]
 fn decode_image(path: &Path, name: &str, size: Option<[usize; 2]>) -> Result<Image> {
-    use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
-
     let missing = |doing: &str, e: &std::io::Error| {
         let e = std::io::Error::new(e.kind(), format!("{e} (image of camera {name})"));
         Error::io(path, doing, &e)
     };
     let file = File::open(path).map_err(|e| missing("open", &e))?;
     let length = file.metadata().map_err(|e| missing("read", &e))?.len();
-    let broken = |e: image::ImageError| Error::format(format!("image of camera {name}: {e}")).in_file(path);
-    let mut reader =
-        ImageReader::new(std::io::BufReader::new(file)).with_guessed_format().map_err(|e| missing("read", &e))?;
+    decode(std::io::BufReader::new(file), length, name, size).map_err(|e| e.in_file(path))
+}
+
+/// Decodes an image of `length` bytes, after its header has passed every check on size.
+#[cfg(feature = "images")]
+fn decode(
+    bytes: impl std::io::BufRead + std::io::Seek,
+    length: u64,
+    name: &str,
+    size: Option<[usize; 2]>,
+) -> Result<Image> {
+    use image::{DynamicImage, ImageDecoder, ImageReader, Limits};
+
+    let broken = |e: image::ImageError| Error::format(format!("image of camera {name}: {e}"));
+    let mut reader = ImageReader::new(bytes)
+        .with_guessed_format()
+        .map_err(|e| Error::new(ErrorKind::Io, format!("cannot read: {e} (image of camera {name})")))?;
     let mut limits = Limits::default();
     limits.max_image_width = Some(MAX_SIDE as u32);
     limits.max_image_height = Some(MAX_SIDE as u32);
@@ -312,16 +350,16 @@ fn decode_image(path: &Path, name: &str, size: Option<[usize; 2]>) -> Result<Ima
     let decoder = reader.into_decoder().map_err(broken)?;
     let (width, height) = decoder.dimensions();
     let (width, height) = (width as usize, height as usize);
-    check_side(name, height, width).map_err(|e| e.in_file(path))?;
+    check_side(name, height, width)?;
     if let Some([h, w]) = size.filter(|&size| size != [height, width]) {
         let message =
             format!("camera {name}: image of {height}x{width}, the calibration expects {h}x{w} (height x width)");
-        return Err(Error::mismatch(message).in_file(path));
+        return Err(Error::mismatch(message));
     }
     if (height * width) as u64 > length.saturating_mul(MAX_PIXELS_PER_BYTE) {
         let message =
             format!("camera {name}: image of {height}x{width} in {length} bytes, expected more bytes for its size");
-        return Err(Error::format(message).in_file(path));
+        return Err(Error::format(message));
     }
     let mut bgr = DynamicImage::from_decoder(decoder).map_err(broken)?.into_rgb8().into_raw();
     bgr.chunks_exact_mut(3).for_each(|p| p.swap(0, 2));

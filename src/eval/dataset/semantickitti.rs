@@ -36,7 +36,8 @@ pub const CLASSES: [&str; 20] = [
     "traffic sign",
 ];
 
-const GRID: Grid = Grid { size: [256, 256, 32], bounds: [[0.0, 51.2], [-25.6, 25.6], [-2.0, 4.4]], axes: Axes::Lidar };
+pub(super) const GRID: Grid =
+    Grid { size: [256, 256, 32], bounds: [[0.0, 51.2], [-25.6, 25.6], [-2.0, 4.4]], axes: Axes::Lidar };
 
 /// The class of a label as it is stored, of the official map; [`IGNORED`] for those that it counts nowhere, none for what is
 /// no label. Moving objects are of the class of those that stand.
@@ -192,7 +193,7 @@ fn labelled(directory: &Path) -> Result<Vec<String>> {
 }
 
 /// The 3x4 matrix of the line `key: ...` of a `calib.txt`.
-fn rows(text: &str, key: &str) -> Result<[[f64; 4]; 3]> {
+pub(super) fn rows(text: &str, key: &str) -> Result<[[f64; 4]; 3]> {
     let line = text.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix(':'));
     let line = line.ok_or_else(|| Error::format(format!("no line \"{key}:\", expected one of 12 numbers")))?;
     let mut numbers = [0.0; 12];
@@ -212,7 +213,7 @@ fn rows(text: &str, key: &str) -> Result<[[f64; 4]; 3]> {
 }
 
 /// Row-major 4x4 of first the rigid `lidar2camera`, then `camera2img`: computed in f64, rounded once.
-fn product(camera2img: &[[f64; 4]; 3], lidar2camera: &[[f64; 4]; 3]) -> [f32; 16] {
+pub(super) fn product(camera2img: &[[f64; 4]; 3], lidar2camera: &[[f64; 4]; 3]) -> [f32; 16] {
     let mut matrix = [0.0; 16];
     matrix[15] = 1.0;
     for (row, factors) in camera2img.iter().enumerate() {
