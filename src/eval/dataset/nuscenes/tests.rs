@@ -279,7 +279,7 @@ fn labels_of_occ3d() {
     said("array \"mask_lidar\": voxel 71 is 2, expected 0 to 1");
     let wide = [Array { name: "semantics", shape: &[1], elements: Elements::U16(&[1]) }];
     write_npz(&file, &wide).expect("written");
-    said("array \"semantics\" has elements of another type, expected u8");
+    said("array \"semantics\" is u16, expected u8");
     fs::write(&file, "PK").expect("written");
     said("not an .npz");
 }
@@ -459,7 +459,7 @@ fn images_that_do_not_fit_are_refused() {
     write_rgb_png(&image, 2, 3, &[0; 18]).expect("written");
     let error = set.frame(0).expect_err("another size");
     assert_eq!((error.kind(), error.path()), (ErrorKind::Mismatch, Some(&*image)), "{error}");
-    assert!(error.message().contains("camera CAM_BACK: image of 3x2, the calibration expects 2x3"), "{error}");
+    assert!(error.message().contains("image of camera CAM_BACK: 3x2, the calibration expects 2x3"), "{error}");
     fs::remove_file(&image).expect("removed");
     assert_eq!(set.frame(0).expect_err("no image").path(), Some(&*image));
 }
