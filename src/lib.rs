@@ -99,6 +99,7 @@ import(&checkpoint, &network, Options::default(), Path::new("model.safetensors")
 //! | `npz` | `npz`: NumPy's `.npz`, written and read; `labels`: label files, read |
 //! | `html` | `html`: results as a page to look at in a browser; with `images` and `npz` |
 //! | `capi` | the functions of `include/voxcast.h`, for C; see `docs/embedding.md` |
+//! | `mcap` | `log`: robot logs, written and replayed; with `images` |
 //! | `eval` | `dataset` and `eval`: frames with labels, and scores; with `images` and `npz` |
 //!
 //! Without features the library reads models, rigs and `.safetensors` scenes, and runs them.
@@ -118,6 +119,8 @@ pub mod eval;
 pub mod file;
 pub mod graph;
 pub mod image;
+#[cfg(feature = "mcap")]
+pub mod log;
 pub mod model;
 pub mod network;
 pub mod rig;

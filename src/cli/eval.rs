@@ -40,7 +40,7 @@ pub struct Eval {
     /// Instead of a model, predict in each voxel the class that is most frequent there in another set
     #[arg(long, value_name = "SET")]
     majority: Option<Source>,
-    /// The data set, as below: synthetic:DIR, surroundocc:..., occ3d:... or semantickitti:...
+    /// The data set, as below: synthetic:DIR, surroundocc:..., occ3d:..., semantickitti:... and others
     #[arg(long, value_name = "SET")]
     data: Source,
     /// Only the first N frames
@@ -119,6 +119,7 @@ impl Eval {
         let predictor = |name: String, says: Says, always| -> Result<Predictor> {
             let grid = says.grid(always);
             let scorer = Scorer::new(set.classes().len(), set.masks().len(), set.grid(), grid, options)?;
+            let scorer = scorer.with_published(set.published());
             Ok(Predictor { name, says, scorer })
         };
         if let Some(source) = &self.majority {
@@ -184,11 +185,13 @@ impl Eval {
         let reports: Vec<Report<'_>> = titles
             .iter()
             .zip(&totals.scores)
-            .map(|(title, total)| Report {
+            .zip(predictors)
+            .map(|((title, total), predictor)| Report {
                 title,
                 classes: set.classes(),
                 regions: &regions,
                 rings: &options.rings,
+                published: predictor.scorer.published(),
                 frames,
                 total,
             })

@@ -5,6 +5,7 @@ mod demo;
 mod dump;
 mod eval;
 mod frame;
+mod frames;
 mod import;
 mod inspect;
 mod profile;
@@ -35,6 +36,7 @@ Examples:
   voxcast import epoch_24.pth --network nuscenes-200 -o model.safetensors
   voxcast rig scene/ --model model.safetensors -o rig.safetensors
   voxcast run --model model.safetensors --rig rig.safetensors scene/ -o out.npz --png out.png
+  voxcast run --model model.safetensors log.mcap -o out.mcap
   voxcast view out.npz --scene scene/ -o out.html
   voxcast inspect model.safetensors
   voxcast eval --model model.safetensors --data synthetic:heldout
@@ -76,10 +78,7 @@ impl Arguments {
             Command::Demo(command) => command.run(),
             Command::Import(command) => command.run(),
             Command::Rig(command) => command.run(),
-            Command::Run(command) => match sequence::scenes(&command.scene)? {
-                Some(scenes) => command.run_sequence(&scenes),
-                None => command.run(),
-            },
+            Command::Run(command) => command.run(),
             Command::View(command) => command.run(),
             Command::Inspect(command) => command.run(),
             Command::Profile(command) => command.run(),

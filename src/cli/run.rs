@@ -15,10 +15,11 @@ use voxcast::picture::{self, Figure, Palette};
 use voxcast::session::{Occupancy, views};
 use voxcast::{Error, Network, Note, Result, Scene};
 
-/// Run a model on a scene and write the class of every voxel.
+/// Run a model on a scene, a drive or a robot log and write the class of every voxel.
 ///
 /// A directory of scenes, such as a drive that `voxcast synth --frames` draws, is run with one session, in the order of names.
-/// Latencies are those of all scenes but the first, which stands apart: it also waits for the model's pages.
+/// Latencies are those of all scenes but the first, which stands apart: it also waits for the model's pages. A log (.mcap)
+/// of Foxglove's messages or a ROS 2 bag is run likewise, frame by frame; with -o OUT.mcap results become a log.
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Examples:
@@ -27,6 +28,9 @@ Examples:
   voxcast run --model model.safetensors scene/ -o out.npz --html out.html
   voxcast run --model model.safetensors scene/ -o out.npz --mask CAM_BACK,2
   voxcast run --model model.safetensors drive/ -o out/ --animation drive.png
+  voxcast run --model model.safetensors drive/ -o out.mcap          # opens in Foxglove, Rerun and PlotJuggler
+  voxcast run --model model.safetensors log.mcap -o out.mcap
+  voxcast run --model model.safetensors bag.mcap -o out/ --frame base_link --camera front=/front/image_raw
   voxcast run --model model.safetensors scene/ -o out.npz --dump stages/ --stages level1.volume,logits.lvl0
 
 In Python: numpy.load('out.npz')['classes'] is u8 [X, Y, Z], and ['support'] u16 [X, Y, Z] says by how many feature
@@ -36,6 +40,8 @@ Without --rig the matrices are built from the scene's calibration before the fra
 calibration is an error, unless --any-rig is given; one that does not say from which, as those of other programs, is used,
 and a note says so. Notes go to standard error and change nothing: what in the scene's files is not obeyed, and cameras
 that see too little of the grid (all together less than 10 % of the voxels, or one less than 2 %).
+In logs, cameras are found by their topics, images are joined to frames by their stamps, transforms are chained at the
+images' times, distorted images are straightened, and a camera without an image is masked.
 The digest is the XXH3-64 of the classes; it is the same on any number of threads and any instruction set.")]
 pub struct Run {
     /// The model
@@ -47,10 +53,10 @@ pub struct Run {
     /// Use that rig even if it was made from another calibration than the scene's
     #[arg(long, requires = "rig")]
     pub(super) any_rig: bool,
-    /// A scene directory or .safetensors, or a directory of those
+    /// A scene directory or .safetensors, a directory of those, or a robot log (.mcap)
     pub(super) scene: PathBuf,
-    /// The .npz to write, or of a sequence the directory for one per scene: `classes` u8 and `support` u16, both [X, Y, Z], `bounds` and `colours`
-    #[arg(short, long, value_name = "OUT.npz")]
+    /// The .npz to write, of a sequence or log the directory for one per frame, or a log (.mcap). A .npz holds `classes` u8 and `support` u16, both [X, Y, Z], `bounds` and `colours`
+    #[arg(short, long, value_name = "OUT")]
     pub(super) output: PathBuf,
     /// Also write `logits` f32 [X, Y, Z, K]
     #[arg(long)]
@@ -71,6 +77,16 @@ pub struct Run {
     #[arg(long, value_name = "PIXELS", default_value_t = 960, requires = "animation",
         value_parser = clap::value_parser!(u16).range(160..=2400))]
     pub(super) width: u16,
+    /// Of a log: a camera and the topic of its images, as often as there are cameras, in the order of the network's training
+    /// [default: all topics with images]
+    #[arg(long, value_name = "NAME=TOPIC", value_parser = camera)]
+    pub(super) camera: Vec<(String, String)>,
+    /// Of a log: the frame of reference in which the network sees [default: a lidar's]
+    #[arg(long, value_name = "NAME")]
+    pub(super) frame: Option<String>,
+    /// Of a log: by how much later than its first image the others of a frame may be, less than a camera's period
+    #[arg(long, value_name = "MILLISECONDS", default_value_t = 50, value_parser = clap::value_parser!(u32).range(0..=10_000))]
+    pub(super) tolerance: u32,
     /// Leave cameras out, by name or number from 0, separated by commas: as if the rig had them not
     #[arg(long, value_name = "CAMERAS", value_delimiter = ',')]
     pub(super) mask: Vec<String>,
@@ -91,8 +107,16 @@ pub struct Run {
     pub(super) machine: Machine,
 }
 
+/// `NAME=TOPIC`.
+fn camera(text: &str) -> std::result::Result<(String, String), String> {
+    let parts = text.split_once('=').filter(|(name, topic)| !name.is_empty() && !topic.is_empty());
+    let (name, topic) = parts.ok_or("expected NAME=TOPIC, such as front=/front/image_raw")?;
+    Ok((name.to_owned(), topic.to_owned()))
+}
+
 impl Run {
-    pub fn run(self) -> Result<()> {
+    /// Runs one scene.
+    pub(super) fn run_scene(self) -> Result<()> {
         if self.animation.is_some() {
             let message = "--animation needs a directory of scenes, and this is one scene";
             return Err(Error::mismatch(message).in_file(&self.scene));

@@ -1,12 +1,14 @@
-//! `voxcast run` over the scenes of a drive, with one session.
+//! `voxcast run` over the scenes of a drive or the frames of a robot log, with one session.
 
 use super::frame::{self, Moving};
-use super::run::{Run, digest, draw, masked, seen, title, write};
+use super::frames::{self, Frame, Frames, Results};
+use super::run::{Run, digest, draw, masked, seen, title};
 use super::terminal;
-use std::collections::{BTreeSet, HashMap};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+use voxcast::log::Summary;
 use voxcast::picture::Animation;
 use voxcast::{Error, Model, Note, Result, Scene, SessionOptions};
 
@@ -29,101 +31,127 @@ pub fn scenes(path: &Path) -> Result<Option<Vec<PathBuf>>> {
     Ok((!scenes.is_empty()).then_some(scenes))
 }
 
-/// What the results of scenes are called: a directory's name, or a file's without its ending.
-fn names(scenes: &[PathBuf]) -> Result<Vec<String>> {
-    let mut names = Vec::with_capacity(scenes.len());
-    let mut taken = HashMap::new();
-    for path in scenes {
-        let name = if path.is_dir() { path.file_name() } else { path.file_stem() };
-        let name = name.unwrap_or_default().to_string_lossy().into_owned();
-        if let Some(other) = taken.insert(name.clone(), path) {
-            let message = format!("its result would be called {name}.npz, as that of {}", other.display());
-            return Err(Error::mismatch(message).in_file(path));
-        }
-        names.push(name);
-    }
-    Ok(names)
-}
-
-/// What is known about a scene that was run.
+/// What is known about a frame that was run.
 struct Done {
     name: String,
     digest: String,
     /// The share of the voxels that a camera sees.
     seen: f64,
+    stamp: u64,
+    /// Names of cameras without an image.
+    missing: Vec<String>,
     read: Duration,
     frame: Duration,
 }
 
 impl Run {
-    pub fn run_sequence(&self, scenes: &[PathBuf]) -> Result<()> {
+    /// Runs the scene, the scenes of a directory, or the frames of a log.
+    pub fn run(self) -> Result<()> {
+        if frames::is_log(&self.scene) {
+            return self.run_sequence(None);
+        }
+        if !self.camera.is_empty() || self.frame.is_some() {
+            let message = "--camera and --frame are about logs, and this is none (.mcap)";
+            return Err(Error::mismatch(message).in_file(&self.scene));
+        }
+        if let Some(scenes) = scenes(&self.scene)? {
+            return self.run_sequence(Some(&scenes));
+        }
+        if frames::is_log(&self.output) && self.animation.is_none() {
+            return self.run_sequence(Some(std::slice::from_ref(&self.scene)));
+        }
+        self.run_scene()
+    }
+
+    /// Runs the scenes in `scenes`, or the log that the user names.
+    fn run_sequence(&self, scenes: Option<&[PathBuf]>) -> Result<()> {
         for (flag, given) in
             [("--png", self.png.is_some()), ("--html", self.html.is_some()), ("--dump", self.dump.is_some())]
         {
             if given {
-                let message = format!("{flag} shows one scene, and this is a sequence of {}", scenes.len());
+                let message = match scenes {
+                    Some([_]) => format!("{flag} goes with -o OUT.npz, and not with a log"),
+                    Some(scenes) => format!("{flag} shows one scene, and this is a sequence of {}", scenes.len()),
+                    None => format!("{flag} shows one scene, and this is a log"),
+                };
                 return Err(Error::mismatch(message).in_file(&self.scene));
             }
         }
         if let Some(path) = &self.animation {
             frame::check_output(path)?;
         }
-        let names = names(scenes)?;
-        std::fs::create_dir_all(&self.output).map_err(|e| Error::io(&self.output, "create", &e))?;
         let model = Arc::new(Model::open(&self.model)?);
+        let mut frames = match scenes {
+            Some(scenes) => Frames::of_scenes(scenes)?,
+            None => Frames::of_log(self, model.network())?,
+        };
+        let mut results = Results::create(self, model.network())?;
         let mut options = frame::options(&self.machine)?;
         options.logits = self.logits;
         options.unfolded = self.unfolded;
 
         let mut driver: Option<Driver> = None;
         let mut animation: Option<Animation> = None;
-        let mut done: Vec<Done> = Vec::with_capacity(scenes.len());
+        let count = frames.len();
+        let mut done: Vec<Done> = Vec::with_capacity(count);
         let mut said = Said::default();
-        let bar = terminal::progress("running", scenes.len());
-        for (path, name) in scenes.iter().zip(names) {
+        let bar = terminal::progress("running", count);
+        for index in 0..count {
             let start = Instant::now();
-            let (scene, notes) = frame::read(path, model.network())?;
+            let mut frame = frames.read(index, model.network(), results.takes_files())?;
+            let notes = std::mem::take(&mut frame.notes);
+            let (scene, path) = (&frame.scene, frame.path.clone());
             let read = start.elapsed();
             bar.suspend(|| said.say(notes));
             let driver = match &mut driver {
                 Some(driver) => driver,
                 none => {
-                    let driver = none.insert(Driver::new(self, &model, &scene, &options)?);
+                    let driver = none.insert(Driver::new(self, &model, scene, &options)?);
                     bar.suspend(|| said.say(std::mem::take(&mut driver.moving.notes)));
                     driver
                 }
             };
-            driver.prepare(self, &scene).map_err(|e| e.in_file(path))?;
+            driver.prepare(self, &frame).map_err(|e| e.in_file(&path))?;
             let start = Instant::now();
-            let result = driver.moving.session.run_scene(&scene).map_err(|e| e.in_file(path))?;
-            let frame = start.elapsed();
-            write(&self.output.join(format!("{name}.npz")), model.network(), &result, self.logits)?;
+            let result = driver.moving.session.run_scene(scene).map_err(|e| e.in_file(&path))?;
+            let latency = start.elapsed();
             if let Some(path) = &self.animation {
-                let subtitle = format!("{name}, {} of {}", done.len() + 1, scenes.len());
-                let page = draw(model.network(), &scene, &result, &title(&self.model), &subtitle)?;
+                let subtitle = format!("{}, {} of {count}", frame.name, index + 1);
+                let page = draw(model.network(), scene, &result, &title(&self.model), &subtitle)?;
                 let page = page.scaled(usize::from(self.width));
                 let animation = match &mut animation {
                     Some(animation) => animation,
                     none => {
                         let size = [page.width, page.height];
-                        none.insert(Animation::create(path, size, scenes.len(), self.rate)?)
+                        none.insert(Animation::create(path, size, count, self.rate)?)
                     }
                 };
                 animation.push(&page.fitted(animation.size()))?;
             }
-            done.push(Done { name, digest: digest(&result), seen: seen(&result), read, frame });
+            let missing = frame.missing().map(|camera| scene.names[camera].clone()).collect();
+            let (name, stamp) = (frame.name.clone(), frame.stamp);
+            let (digest, seen) = (digest(&result), seen(&result));
+            done.push(Done { name, digest, seen, stamp, missing, read, frame: latency });
+            results.push(model.network(), frame, result, latency, self.logits)?;
             bar.inc(1);
         }
         bar.finish_and_clear();
+        results.finish()?;
         if let Some(animation) = animation {
             animation.finish()?;
         }
         let rigs = driver.map_or((0, Duration::ZERO), |driver| (driver.moving.rigs, driver.moving.rig_time));
-        self.print_sequence(&done, rigs, &said.notes);
+        self.print_sequence(&done, frames.summary(), rigs, &said.notes);
         Ok(())
     }
 
-    fn print_sequence(&self, done: &[Done], (rigs, rig_time): (usize, Duration), notes: &[Note]) {
+    fn print_sequence(
+        &self,
+        done: &[Done],
+        log: Option<&Summary>,
+        (rigs, rig_time): (usize, Duration),
+        notes: &[Note],
+    ) {
         let latency = Latency::of(done.iter().map(|done| done.frame));
         let read = Latency::of(done.iter().map(|done| done.read));
         let all: String = done.iter().map(|done| done.digest.as_str()).collect();
@@ -132,34 +160,61 @@ impl Run {
             let scenes: Vec<_> = done
                 .iter()
                 .map(|done| {
-                    serde_json::json!({
+                    let mut scene = serde_json::json!({
                         "scene": done.name,
                         "digest": done.digest,
                         "seen": done.seen,
                         "read_seconds": done.read.as_secs_f64(),
                         "frame_seconds": done.frame.as_secs_f64(),
-                    })
+                    });
+                    if log.is_some() {
+                        scene["stamp"] = done.stamp.into();
+                        scene["missing"] = done.missing.clone().into();
+                    }
+                    scene
                 })
                 .collect();
-            let value = serde_json::json!({
+            let mut value = serde_json::json!({
                 "digest": all,
                 "scenes": scenes,
                 "rigs": rigs,
                 "notes": notes.iter().map(ToString::to_string).collect::<Vec<_>>(),
                 "seconds": { "frame": latency.json(), "read": read.json(), "rigs": rig_time.as_secs_f64() },
             });
+            if let Some(log) = log {
+                value["log"] = serde_json::json!({
+                    "extent": log.extent.to_string(),
+                    "read": log.extent.read,
+                    "length": log.extent.length,
+                    "cameras": log.cameras.iter().map(|(name, topic)| [name, topic]).collect::<Vec<_>>(),
+                    "frame": log.frame,
+                    "incomplete": log.incomplete,
+                    "left_out": log.left_out,
+                    "without_transform": log.without_transform,
+                });
+            }
             println!("{value}");
             return;
         }
-        println!("{} scenes with one session, digest {all}", done.len());
+        let what = if log.is_some() { "frames" } else { "scenes" };
+        println!("{} {what} with one session, digest {all}", done.len());
         let shares = || done.iter().map(|done| done.seen);
         println!(
             "cameras see {} to {} of the voxels",
             terminal::percent(shares().fold(1.0, f64::min)),
             terminal::percent(shares().fold(0.0, f64::max))
         );
+        if let Some(log) = log {
+            println!("log {}", log.extent);
+            let cameras: Vec<String> = log.cameras.iter().map(|(name, topic)| format!("{name} {topic}")).collect();
+            println!("cameras in frame {}: {}", log.frame, cameras.join(", "));
+            println!(
+                "{} frames lack an image, {} images belong to no frame, {} frames have no transform at their time",
+                log.incomplete, log.left_out, log.without_transform
+            );
+        }
         println!("frame {latency}");
-        println!("reading a scene {read}");
+        println!("reading a {} {read}", if log.is_some() { "frame" } else { "scene" });
         println!("rigs: {rigs}, in {}", terminal::time(rig_time));
     }
 }
@@ -194,9 +249,10 @@ impl Driver {
         Ok(Self { moving: Moving::new(model, run.rig_file(), scene, options)?, masked: BTreeSet::new() })
     }
 
-    /// Makes the session ready for a scene: builds the matrices anew where its cameras have moved, and masks those that
-    /// the user names.
-    fn prepare(&mut self, run: &Run, scene: &Scene) -> Result<()> {
+    /// Makes the session ready for a frame: builds the matrices anew where its cameras have moved, and masks those that
+    /// the user names and those without an image.
+    fn prepare(&mut self, run: &Run, frame: &Frame) -> Result<()> {
+        let scene = &frame.scene;
         if run.any_rig {
             self.moving.check_count(scene)?;
         } else if run.rig.is_some() && !self.moving.fits(scene) {
@@ -206,7 +262,8 @@ impl Driver {
         } else {
             self.moving.calibrate(scene)?;
         }
-        let masked = masked(&run.mask, scene)?;
+        let mut masked = masked(&run.mask, scene)?;
+        masked.extend(frame.missing());
         for camera in self.masked.symmetric_difference(&masked) {
             self.moving.session.set_masked(*camera, masked.contains(camera))?;
         }
@@ -258,16 +315,6 @@ impl std::fmt::Display for Latency {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn names_are_told_apart() {
-        let dir = tempfile::tempdir().unwrap();
-        let paths = ["153.612", "153.664", "a.safetensors"].map(|name| dir.path().join(name));
-        paths[..2].iter().for_each(|path| std::fs::create_dir(path).unwrap());
-        assert_eq!(names(&paths).unwrap(), ["153.612", "153.664", "a"]);
-        let twice = [dir.path().join("153.612"), dir.path().join("153.612.safetensors")];
-        assert!(names(&twice).unwrap_err().message().contains("called 153.612.npz"));
-    }
 
     #[test]
     fn ranks_of_latencies_by_hand() {

@@ -6,7 +6,8 @@ use std::str::FromStr;
 use voxcast::Result;
 use voxcast::dataset::nuscenes::{Labels, Scenes};
 use voxcast::dataset::semantickitti::{Scans, Split};
-use voxcast::dataset::{DataSet, NuScenes, SemanticKitti, Synthetic};
+use voxcast::dataset::{DataSet, NuScenes, Occ3dWaymo, SemanticKitti, SscBench, Synthetic};
+use voxcast::dataset::{occ3d_waymo, sscbench};
 
 /// How sets are named, for help texts.
 pub const FORMS: &str = "\
@@ -14,15 +15,20 @@ Data sets:
   synthetic:DIR                       what synth --set wrote
   surroundocc:ROOT:LABELS[:SCENES]    nuScenes with the labels of SurroundOcc, LABELS/samples/*.pcd.bin.npy
   occ3d:ROOT:LABELS[:SCENES]          nuScenes with the labels of Occ3D, LABELS/<scene>/<sample>/labels.npz (\"gts\")
+  openocc:ROOT:LABELS[:SCENES]        nuScenes with the labels of OpenOcc v2, LABELS/<scene>/<sample>/labels.npz (\"openocc_v2\")
+  occ3d-waymo:ROOT:LABELS:SPLIT       Waymo in the KITTI format of mmdetection3d, LABELS/NNN/FFF_04.npz of Occ3D
+  sscbench:ROOT[:SPLIT]               KITTI-360 of SSCBench, ROOT/{preprocess/labels,data_2d_raw,calibration}
   semantickitti:ROOT[:SPLIT[:stereo][:all]]
                                       scene completion of SemanticKITTI, ROOT/sequences/NN
 
 ROOT of nuScenes has samples/ and one v1.0-* of tables; of several, name the one, such as ROOT/v1.0-mini.
 SCENES: val (the official 150), train (all others), or a file with a name such as scene-0103 a line; all by default.
-SPLIT: val (08, the default), train, test, or a sequence such as 05. stereo adds image_3 as a second camera.
+SPLIT of Waymo: training or validation; of KITTI-360: val (the default), train or test.
+SPLIT of SemanticKITTI: val (08, the default), train, test, or a sequence such as 05. stereo adds image_3 as a second camera.
 Scored is every fifth scan, as in the benchmark; all scores every scan that has labels.";
 
-const EXPECTED: &str = "expected synthetic:DIR, surroundocc:ROOT:LABELS[:SCENES], occ3d:ROOT:LABELS[:SCENES] or \
+const EXPECTED: &str = "expected synthetic:DIR, surroundocc:ROOT:LABELS[:SCENES], occ3d:ROOT:LABELS[:SCENES], \
+                        openocc:ROOT:LABELS[:SCENES], occ3d-waymo:ROOT:LABELS:SPLIT, sscbench:ROOT[:SPLIT] or \
                         semantickitti:ROOT[:SPLIT[:stereo][:all]]";
 
 /// A data set, not yet opened.
@@ -37,6 +43,8 @@ pub struct Source {
 enum Kind {
     Synthetic(PathBuf),
     NuScenes { root: PathBuf, labels: Labels, directory: PathBuf, scenes: Scenes },
+    Occ3dWaymo { root: PathBuf, labels: PathBuf, split: occ3d_waymo::Split },
+    SscBench { root: PathBuf, split: sscbench::Split },
     SemanticKitti { root: PathBuf, split: Split, stereo: bool, scans: Scans },
 }
 
@@ -54,6 +62,14 @@ impl FromStr for Source {
             ("occ3d", [root, directory, scenes @ ..]) if scenes.len() < 2 => {
                 nuscenes(root, Labels::Occ3d, directory, scenes)
             }
+            ("openocc", [root, directory, scenes @ ..]) if scenes.len() < 2 => {
+                nuscenes(root, Labels::OpenOcc, directory, scenes)
+            }
+            ("occ3d-waymo", [root, labels, split]) => {
+                Kind::Occ3dWaymo { root: root.into(), labels: labels.into(), split: split.parse()? }
+            }
+            ("sscbench", [root]) => Kind::SscBench { root: root.into(), split: sscbench::Split::Val },
+            ("sscbench", [root, split]) => Kind::SscBench { root: root.into(), split: split.parse()? },
             ("semantickitti", [root]) => kitti(root, Split::Val, false, Scans::Benchmark),
             ("semantickitti", [root, split]) => kitti(root, split.parse()?, false, Scans::Benchmark),
             ("semantickitti", [root, split, "stereo"]) => kitti(root, split.parse()?, true, Scans::Benchmark),
@@ -93,6 +109,8 @@ impl Source {
             Kind::NuScenes { root, labels, directory, scenes } => {
                 Box::new(NuScenes::open(root, *labels, directory, scenes)?)
             }
+            Kind::Occ3dWaymo { root, labels, split } => Box::new(Occ3dWaymo::open(root, labels, *split)?),
+            Kind::SscBench { root, split } => Box::new(SscBench::open(root, *split)?),
             Kind::SemanticKitti { root, split, stereo, scans } => {
                 Box::new(SemanticKitti::open(root, *split, *stereo, *scans)?)
             }
@@ -135,6 +153,17 @@ mod tests {
     }
 
     #[test]
+    fn further_sets_by_name() {
+        let Kind::NuScenes { labels, scenes, .. } = kind("openocc:n:g:val") else { panic!("nuScenes") };
+        assert_eq!((labels, scenes), (Labels::OpenOcc, Scenes::Val));
+        let Kind::Occ3dWaymo { labels, split, .. } = kind("occ3d-waymo:k:voxel04:validation") else { panic!("Waymo") };
+        assert_eq!((labels, split), (PathBuf::from("voxel04"), occ3d_waymo::Split::Validation));
+        for (text, expected) in [("sscbench:k", sscbench::Split::Val), ("sscbench:k:test", sscbench::Split::Test)] {
+            assert!(matches!(kind(text), Kind::SscBench { split, .. } if split == expected), "{text}");
+        }
+    }
+
+    #[test]
     fn what_names_no_set_is_refused() {
         for text in [
             "",
@@ -144,9 +173,12 @@ mod tests {
             "occ3d:n:g:val:x",
             "semantickitti:k:val:mono",
             "semantickitti:k:val:all:stereo",
+            "occ3d-waymo:k:l",
         ] {
             assert_eq!(text.parse::<Source>().expect_err(text), EXPECTED);
         }
+        assert!("sscbench:k:08".parse::<Source>().expect_err("08").contains("train, val or test"));
+        assert!("occ3d-waymo:k:l:val".parse::<Source>().expect_err("val").contains("training or validation"));
         assert!("semantickitti:k:23".parse::<Source>().expect_err("23").contains("a sequence 00 to 21"));
     }
 }

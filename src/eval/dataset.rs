@@ -3,14 +3,20 @@
 //! A [`DataSet`] is a list of frames that can be read in any order, from several threads at once; nothing is kept between
 //! frames but the index. Labels are classes of the network's training, [`IGNORED`] where there is no truth.
 
+mod arrays;
 pub mod nuscenes;
-mod pose;
+pub mod occ3d_waymo;
+mod published;
 pub mod semantickitti;
+pub mod sscbench;
 mod synthetic;
 
+pub use crate::base::pose::Pose;
 pub use nuscenes::NuScenes;
-pub use pose::Pose;
+pub use occ3d_waymo::Occ3dWaymo;
+pub use published::Published;
 pub use semantickitti::SemanticKitti;
+pub use sscbench::SscBench;
 pub use synthetic::Synthetic;
 
 pub use crate::network::{Axes, Grid};
@@ -22,10 +28,18 @@ use std::path::{Component, Path};
 /// Label of a voxel about which nothing is known, or which no score counts.
 pub const IGNORED: u8 = crate::file::labels::UNLABELLED;
 
+/// Label of a voxel of a class that networks do not have. It counts in the set's [`Published`] score alone.
+pub const OTHERS: u8 = IGNORED - 1;
+
+/// Whether a label is a class, rather than [`IGNORED`] or [`OTHERS`].
+pub(crate) fn is_class(label: u8) -> bool {
+    label < OTHERS
+}
+
 /// What is known about a frame's voxels, `[x, y, z]`, z fastest.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Truth {
-    /// Class of each voxel, 0 is empty; [`IGNORED`] counts nowhere.
+    /// Class of each voxel, 0 is empty; [`IGNORED`] counts nowhere, [`OTHERS`] in the [`Published`] score alone.
     pub labels: Vec<u8>,
     /// For each of [`DataSet::masks`], 1 for the voxels that belong to it, else 0.
     pub masks: Vec<Vec<u8>>,
@@ -54,6 +68,11 @@ pub trait DataSet: Send + Sync {
 
     /// Names of the masks that every frame has: parts of the grid to be scored by themselves.
     fn masks(&self) -> &[&'static str];
+
+    /// How the set's own evaluation counts, where that differs.
+    fn published(&self) -> Option<Published> {
+        None
+    }
 
     /// Number of frames.
     fn len(&self) -> usize;

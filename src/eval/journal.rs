@@ -41,6 +41,7 @@ struct Line {
 #[serde(deny_unknown_fields)]
 struct LineScore {
     regions: Vec<Vec<Vec<u64>>>,
+    published: Vec<u64>,
     /// Labelled, predicted, and hits at each threshold.
     rays: [Vec<u64>; 5],
     /// Frames; then the bits of focal, Lovasz, geometric and semantic sums, because decimals may lose the last one.
@@ -164,6 +165,7 @@ impl LineScore {
         let [focal, lovasz, geometric, semantic] = [focal, lovasz, geometric, semantic].map(f64::to_bits);
         Self {
             regions: score.regions.iter().map(|rings| rings.iter().map(sparse).collect()).collect(),
+            published: sparse(&score.published),
             rays: [labelled, predicted, one, two, four].map(Vec::clone),
             losses: [score.losses.frames, focal, lovasz, geometric, semantic],
         }
@@ -185,8 +187,10 @@ impl LineScore {
             && [&one, &two, &four].into_iter().all(possible);
         let [frames, losses @ ..] = self.losses;
         let [focal, lovasz, geometric, semantic] = losses.map(f64::from_bits);
+        let published = dense(kind.classes + 1, &self.published)?;
         right.then_some(Score {
             regions,
+            published,
             rays: RayCounts { labelled, predicted, hits: [one, two, four] },
             losses: LossSum { frames, sum: Losses { focal, lovasz, geometric, semantic } },
         })
@@ -221,6 +225,7 @@ mod tests {
         for score in &mut scores {
             score.regions[1][0].add(seed % 3, 2);
             (score.rays.labelled[1], score.rays.predicted[1]) = (9, 12);
+            score.published.add(3, seed % 3);
             score.rays.hits[2][1] = u64::from(seed);
             let value = f64::from(seed) / 3.0;
             score.losses.add(&Losses { focal: value, lovasz: value.exp(), geometric: 1e-300, semantic: -0.0 });

@@ -3,7 +3,7 @@
 //!
 //! `docs/evaluation.md` has the formulas.
 
-use crate::eval::dataset::IGNORED;
+use crate::eval::dataset::is_class;
 
 /// A term -ln q is cut off here, as PyTorch's binary cross-entropy does.
 const MAX_LOG: f64 = 100.0;
@@ -22,13 +22,13 @@ pub struct Losses {
     pub semantic: f64,
 }
 
-/// The losses of `logits`, `[voxels, classes]`, for `labels` (one per voxel), over the voxels that are not [`IGNORED`]; zeros if all
+/// The losses of `logits`, `[voxels, classes]`, for `labels` (one per voxel), over the voxels whose label is a class; zeros if all
 /// are. `weights` are those of the focal loss, one per class, 1 by default.
 ///
 /// Takes 8 bytes per logit for the probabilities, and 16 per voxel to sort them.
 ///
 /// # Panics
-/// If there are no classes, a length does not fit, or a label is neither a class nor [`IGNORED`].
+/// If there are no classes, a length does not fit, or a class is not below `classes`.
 pub fn losses(logits: &[f32], labels: &[u8], classes: usize, weights: Option<&[f64]>) -> Losses {
     assert_eq!(logits.len(), labels.len() * classes, "logits for every voxel and class");
     assert!(weights.is_none_or(|w| w.len() == classes), "a weight for every class");
@@ -36,7 +36,7 @@ pub fn losses(logits: &[f32], labels: &[u8], classes: usize, weights: Option<&[f
     let mut truth = Vec::with_capacity(labels.len());
     let mut focal = 0.0;
     for (logits, &label) in logits.chunks_exact(classes).zip(labels) {
-        if label == IGNORED {
+        if !is_class(label) {
             continue;
         }
         let class = usize::from(label);
@@ -148,6 +148,7 @@ fn semantic(probabilities: &[f64], truth: &[u8], classes: usize) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::eval::dataset::IGNORED;
     use serde_json::Value;
 
     /// Cases and values of the training code, computed with PyTorch in f64.

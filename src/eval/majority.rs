@@ -1,7 +1,7 @@
 //! The image-blind baseline: what mostly stands in each voxel, whatever the cameras see.
 
 use crate::base::error::{Error, ErrorKind, Result};
-use crate::eval::dataset::{DataSet, IGNORED};
+use crate::eval::dataset::{DataSet, is_class};
 
 /// The class that most frames of `set` have in each voxel; of equally frequent ones the first. Voxels that no frame has a
 /// label for are empty. The voxels are those of `set`'s grid, with its axes. `done` is told how many frames were read.
@@ -19,7 +19,7 @@ pub fn majority(set: &dyn DataSet, done: &mut dyn FnMut(usize)) -> Result<Vec<u8
     for index in 0..set.len() {
         let truth = set.truth(index)?;
         for (counts, &label) in counts.chunks_exact_mut(classes).zip(&truth.labels) {
-            if label != IGNORED {
+            if is_class(label) {
                 counts[usize::from(label)] += 1;
             }
         }

@@ -21,13 +21,14 @@ mod totals;
 
 pub use comparison::Comparison;
 pub use confusion::Confusion;
+pub use dataset::Published;
 pub use journal::Journal;
 pub use majority::majority;
 pub use report::Report;
 pub use totals::{FrameScore, Totals};
 
 use crate::base::error::{Error, Result};
-use crate::eval::dataset::{Axes, Grid, IGNORED, Pose, Truth};
+use crate::eval::dataset::{Axes, Grid, IGNORED, OTHERS, Pose, Truth, is_class};
 use crate::file::replace::replace_file;
 use losses::{Losses, losses};
 use ray_iou::{RayCounts, count_rays};
@@ -73,6 +74,7 @@ pub struct Scorer {
     /// Ring of each column (x, y) of the truth, if its axes are the lidar's.
     ring_of: Vec<u8>,
     correspondence: Correspondence,
+    published: Option<Published>,
 }
 
 /// How voxels of the truth are found in the prediction.
@@ -118,7 +120,20 @@ impl Scorer {
             _ => Correspondence::Indices([0, 1, 2].map(|axis| nearest(&truth, &prediction, axis))),
         };
         let (ends, directions) = (rings.clone(), ray_iou::directions());
-        Ok(Self { classes, truth, prediction, masks, ends, directions, ring_of, correspondence })
+        let published = None;
+        Ok(Self { classes, truth, prediction, masks, ends, directions, ring_of, correspondence, published })
+    }
+
+    /// The same scorer, which also counts as the set's own evaluation does, if that is defined for the two grids.
+    #[must_use]
+    pub fn with_published(self, published: Option<Published>) -> Self {
+        let published = published.filter(|published| published.applies(&self.truth, &self.prediction));
+        Self { published, ..self }
+    }
+
+    /// How the set's own evaluation is counted, if it is.
+    pub fn published(&self) -> Option<Published> {
+        self.published
     }
 
     /// Names of the regions that scores are told apart by: "all" voxels, those of each mask, and those that the rig
@@ -139,6 +154,10 @@ impl Scorer {
         let resampled = self.resampled(pose, prediction.classes);
         let (grid, classes) = (&self.truth, self.classes);
         score.rays = count_rays(grid, classes, &truth.labels, &resampled, &truth.origins, &self.directions);
+        if let Some(published) = self.published {
+            let (grids, classes) = ([&self.truth, &self.prediction], [prediction.classes, &resampled[..]]);
+            score.published = published.count(self.classes, truth, grids, classes);
+        }
         if let Some(logits) = prediction.logits {
             score.losses.add(&losses(logits, &truth.labels, classes, None));
         }
@@ -147,7 +166,7 @@ impl Scorer {
         for (([x, y], &column_ring), first) in columns.zip(&self.ring_of).zip((0..).step_by(nz)) {
             for z in 0..nz {
                 let label = truth.labels[first + z];
-                if label == IGNORED {
+                if !is_class(label) {
                     continue;
                 }
                 let ring = match grid.axes {
@@ -239,7 +258,7 @@ impl Scorer {
             check("logits", logits.len(), predicted * self.classes)?;
         }
         let beyond = |class: &u8| usize::from(*class) >= self.classes;
-        let label = truth.labels.iter().find(|label| beyond(label) && **label != IGNORED);
+        let label = truth.labels.iter().find(|label| beyond(label) && ![OTHERS, IGNORED].contains(*label));
         if let Some(found) = label.or_else(|| prediction.classes.iter().find(|class| beyond(class))) {
             return Err(Error::mismatch(format!("class {found}, expected one of {}", self.classes)));
         }
@@ -274,6 +293,8 @@ pub struct Kind {
 pub struct Score {
     /// For each of [`Scorer::regions`], for each ring of [`Options::rings`] and for what lies beyond the last.
     pub regions: Vec<Vec<Confusion>>,
+    /// What the set's own evaluation counts ([`Scorer::published`]): the classes, and the one that networks do not have.
+    pub published: Confusion,
     /// What rays meet, in [`Truth::origins`].
     pub rays: RayCounts,
     /// Losses of level 0 of the frames whose logits were given.
@@ -321,7 +342,8 @@ impl Score {
     /// Nothing counted.
     pub fn new(kind: Kind) -> Self {
         let regions = vec![vec![Confusion::new(kind.classes); kind.rings]; kind.regions];
-        Self { regions, rays: RayCounts::new(kind.classes), losses: LossSum::default() }
+        let published = Confusion::new(kind.classes + 1);
+        Self { regions, published, rays: RayCounts::new(kind.classes), losses: LossSum::default() }
     }
 
     /// Adds the counts of another score of the same kind.
@@ -330,6 +352,7 @@ impl Score {
     /// If it is of another kind.
     pub fn merge(&mut self, other: &Score) {
         assert_eq!(self.regions.len(), other.regions.len(), "regions");
+        self.published.merge(&other.published);
         self.rays.merge(&other.rays);
         self.losses.merge(&other.losses);
         for (own, other) in self.regions.iter_mut().zip(&other.regions) {

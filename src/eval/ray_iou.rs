@@ -5,7 +5,7 @@
 //! meets an ignored one first, does not count. Of the others, a hit is one of the same class whose distance differs by less
 //! than a threshold; RayIoU of a class is hits / (labelled + predicted - hits). Misses of the prediction are no class.
 
-use crate::eval::dataset::{Grid, IGNORED};
+use crate::eval::dataset::{Grid, is_class};
 
 /// Thresholds in metres.
 pub const THRESHOLDS: [f64; 3] = [1.0, 2.0, 4.0];
@@ -89,7 +89,7 @@ pub fn count_rays(
     for origin in origins {
         for direction in directions {
             let Some((truth, distance)) = first_hit(grid, labels, origin, direction) else { continue };
-            if truth == IGNORED {
+            if !is_class(truth) {
                 continue;
             }
             counts.labelled[usize::from(truth)] += 1;
@@ -156,6 +156,7 @@ fn first_hit(grid: &Grid, classes: &[u8], origin: &[f64; 3], direction: &[f64; 3
 mod tests {
     use super::*;
     use crate::eval::dataset::Axes;
+    use crate::eval::dataset::IGNORED;
 
     const GRID: Grid = Grid { size: [8, 4, 2], bounds: [[0.0, 8.0], [-2.0, 2.0], [-1.0, 1.0]], axes: Axes::Lidar };
 

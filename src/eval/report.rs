@@ -3,7 +3,7 @@
 use super::losses::Losses;
 use super::ray_iou::THRESHOLDS;
 use super::table::{Table, percent};
-use super::{Confusion, Score};
+use super::{Confusion, Published, Score};
 use serde_json::{Value, json};
 
 /// A total with the names of what it counts.
@@ -17,6 +17,8 @@ pub struct Report<'a> {
     pub regions: &'a [&'a str],
     /// Ends of the rings in metres, as in [`Options::rings`](super::Options::rings).
     pub rings: &'a [f64],
+    /// How the set's own evaluation is counted, if it is ([`Scorer::published`](super::Scorer::published)).
+    pub published: Option<Published>,
     /// Frames scored.
     pub frames: usize,
     /// Their sum.
@@ -69,6 +71,7 @@ impl Report<'_> {
             "frames": self.frames,
             "classes": self.classes,
             "regions": regions,
+            "published": self.published(),
             "ray_iou": {
                 "mean": rays.ray_iou(),
                 "thresholds": THRESHOLDS,
@@ -104,6 +107,20 @@ impl Report<'_> {
         })
     }
 
+    fn published(&self) -> Value {
+        let (Some(published), counts) = (self.published, &self.total.published) else { return Value::Null };
+        let names = self.classes.iter().copied().chain(["others"]);
+        let classes: serde_json::Map<String, Value> =
+            names.enumerate().skip(1).map(|(class, name)| (name.to_owned(), json!(counts.class_iou(class)))).collect();
+        json!({
+            "name": published.name(),
+            "miou": published.mean_iou(counts),
+            "iou": counts.iou(),
+            "voxels": counts.voxels(),
+            "classes": classes,
+        })
+    }
+
     fn ring_names(&self) -> Vec<String> {
         let starts = std::iter::once(0.0).chain(self.rings.iter().copied());
         let mut names: Vec<String> = starts.zip(self.rings).map(|(start, end)| format!("{start}-{end} m")).collect();
@@ -118,6 +135,12 @@ impl Report<'_> {
         let iou = self.by_ring("IoU", Confusion::iou);
         let mean = self.by_ring("mIoU", Confusion::mean_iou);
         let mut tables = vec![self.by_class(), iou, mean, self.by_threshold()];
+        tables.extend(self.published.map(|published| {
+            let counts = &self.total.published;
+            let head = ["as published", "mIoU", "IoU"].map(str::to_owned).to_vec();
+            let values = [published.mean_iou(counts), counts.iou()].map(percent);
+            Table { head, rows: vec![std::iter::once(published.name().to_owned()).chain(values).collect()] }
+        }));
         tables.extend(self.total.losses.mean().map(|losses| {
             let values = [losses.focal, losses.lovasz, losses.geometric, losses.semantic];
             let head = ["loss", "focal", "lovasz", "geometric", "semantic"].map(str::to_owned).to_vec();

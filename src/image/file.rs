@@ -9,7 +9,9 @@
 
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::base::note::Note;
-use crate::scene::{Image, MAX_SIDE, check_side, read_bounded};
+use crate::file::bounded::read_bounded;
+use crate::image::{Image, check_side};
+use crate::network::MAX_SIDE;
 use std::path::Path;
 
 /// Pixels that a byte of a PNG can stand for at most: deflate's 1032 bytes of eight one-bit pixels. An image that claims
@@ -33,15 +35,27 @@ const MAX_SCANS: usize = 64;
 /// [`ErrorKind::TooLarge`] for a side beyond [`MAX_SIDE`]; [`ErrorKind::Unsupported`] for what is read nowhere, or read
 /// differently by different programs.
 pub(crate) fn read_image(path: &Path, name: &str, size: Option<[usize; 2]>, notes: &mut Vec<Note>) -> Result<Image> {
-    let said = |e: Error| {
-        let message = format!("image of camera {name}: {}", e.message());
-        Error::new(e.kind(), message).in_file(path)
-    };
-    let bytes = read_bounded(path, MAX_FILE).map_err(said)?;
+    let bytes = read_bounded(path, MAX_FILE).map_err(|e| of_camera(name, &e).in_file(path))?;
     let mut found = Vec::new();
-    let image = decode(&bytes, size, &mut found).map_err(said)?;
-    notes.extend(found.into_iter().map(|what| Note::new(format!("image of camera {name}: {what}")).in_file(path)));
+    let image = decode_image(&bytes, name, size, &mut found).map_err(|e| e.in_file(path))?;
+    notes.extend(found.into_iter().map(|note| note.in_file(path)));
     Ok(image)
+}
+
+/// Decodes the image file of camera `name` that is in memory, as [`read_image`] does.
+///
+/// # Errors
+/// Those of [`read_image`] but for [`ErrorKind::Io`], naming the camera alone.
+pub(crate) fn decode_image(bytes: &[u8], name: &str, size: Option<[usize; 2]>, notes: &mut Vec<Note>) -> Result<Image> {
+    let mut found = Vec::new();
+    let image = decode(bytes, size, &mut found).map_err(|e| of_camera(name, &e))?;
+    notes.extend(found.into_iter().map(|what| Note::new(format!("image of camera {name}: {what}"))));
+    Ok(image)
+}
+
+/// The error, said of a camera's image.
+fn of_camera(name: &str, e: &Error) -> Error {
+    Error::new(e.kind(), format!("image of camera {name}: {}", e.message()))
 }
 
 /// Decodes a file that is in memory; what it says and is not obeyed goes to `notes`.

@@ -6,7 +6,31 @@ pub(crate) mod file;
 #[cfg(feature = "images")]
 pub(crate) mod png;
 
-use crate::base::error::{Error, Result};
+use crate::base::error::{Error, ErrorKind, Result};
+use crate::network::MAX_SIDE;
+
+/// One camera image: 8-bit, three channels, rows top to bottom, **BGR** as the published networks were trained.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Image {
+    /// Rows of pixels.
+    pub height: usize,
+    /// Pixels of a row.
+    pub width: usize,
+    /// `height * width * 3` bytes, blue first.
+    pub bgr: Vec<u8>,
+}
+
+/// Refuses an image without pixels or with a side beyond [`MAX_SIDE`].
+pub(crate) fn check_side(height: usize, width: usize) -> Result<()> {
+    if height == 0 || width == 0 {
+        return Err(Error::format(format!("{height}x{width} (height x width), expected at least one pixel")));
+    }
+    if height > MAX_SIDE || width > MAX_SIDE {
+        let message = format!("{height}x{width} (height x width), expected sides up to {MAX_SIDE}");
+        return Err(Error::new(ErrorKind::TooLarge, message));
+    }
+    Ok(())
+}
 
 /// The order of a pixel's three bytes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

@@ -23,6 +23,10 @@ use glam::{DMat4, DVec4};
 use serde_json::{Map, Value};
 use std::path::{Component, Path};
 
+/// The cameras of nuScenes, in the order of the published networks' training.
+pub const NUSCENES_RING: [&str; 6] =
+    ["CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"];
+
 /// No image side may be longer.
 const MAX_SIDE: u64 = 1 << 16;
 

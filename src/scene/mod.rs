@@ -2,16 +2,19 @@
 
 pub mod camera;
 pub(crate) mod matrix;
+mod stamps;
 
+pub use crate::image::Image;
 pub use crate::network::{MAX_SIDE, forward_of};
+pub use stamps::read_stamps;
 
-use crate::base::error::{Error, ErrorKind, Result};
+use crate::base::error::{Error, Result};
 use crate::base::note::Note;
+use crate::file::bounded::read_bounded;
+use crate::image::check_side;
 use crate::network::Network;
 use crate::scene::camera::read_calibration_with_notes;
 use safetensors::{Dtype, SafeTensors};
-use std::fs::File;
-use std::io::Read;
 use std::path::{Component, Path};
 
 /// Cameras that a scene may have.
@@ -22,17 +25,6 @@ const MAX_CALIBRATION: u64 = 8 << 20;
 
 /// Tensors of a scene file: the two that make the scene, and the labels that `voxcast synth --set` puts beside them.
 const TENSORS: [&str; 6] = ["images", "lidar2img", "labels", "visible", "pixel.class", "pixel.depth"];
-
-/// One camera image: 8-bit, three channels, rows top to bottom, **BGR** as the published networks were trained.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Image {
-    /// Rows of pixels.
-    pub height: usize,
-    /// Pixels of a row.
-    pub width: usize,
-    /// `height * width * 3` bytes, blue first.
-    pub bgr: Vec<u8>,
-}
 
 /// Images of all cameras at one moment, and where each lidar-frame point lands in them.
 #[derive(Clone, Debug, PartialEq)]
@@ -59,13 +51,14 @@ impl Scene {
     /// is not obeyed, [`Scene::open_with_notes`] tells.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] when a file is missing or unreadable, naming the camera; [`ErrorKind::Format`] when it is
-    /// malformed, not whole, holds no camera or more than [`MAX_CAMERAS`], a matrix that is not finite or not what it is
-    /// called ([`read_calibration_with_notes`]), or a file name that leaves the directory; [`ErrorKind::Mismatch`] when an
-    /// image has another size than the calibration says; [`ErrorKind::TooLarge`] when a side exceeds [`MAX_SIDE`];
-    /// [`ErrorKind::Unsupported`] for images that are transparent, turned by a tag, animated, of more than 8 bits a channel
-    /// or of other colours than grey, RGB and YCbCr, for cameras that are no pinholes, and for a directory when the feature
-    /// `images` is off.
+    /// [`ErrorKind::Io`](crate::ErrorKind::Io) when a file is missing or unreadable, naming the camera;
+    /// [`ErrorKind::Format`](crate::ErrorKind::Format) when it is malformed, not whole, holds no camera or more than
+    /// [`MAX_CAMERAS`], a matrix that is not finite or not what it is called ([`read_calibration_with_notes`]), or a file
+    /// name that leaves the directory; [`ErrorKind::Mismatch`](crate::ErrorKind::Mismatch) when an image has another size
+    /// than the calibration says; [`ErrorKind::TooLarge`](crate::ErrorKind::TooLarge) when a side exceeds [`MAX_SIDE`];
+    /// [`ErrorKind::Unsupported`](crate::ErrorKind::Unsupported) for images that are transparent, turned by a tag,
+    /// animated, of more than 8 bits a channel or of other colours than grey, RGB and YCbCr, for cameras that are no
+    /// pinholes, and for a directory when the feature `images` is off.
     pub fn open(path: &Path) -> Result<Self> {
         Self::open_with_notes(path).map(|(scene, _)| scene)
     }
@@ -166,10 +159,20 @@ impl Scene {
     /// camera, named after it. The directory is made if it is missing; each file appears whole or not at all.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] when the directory or a file cannot be written; [`ErrorKind::Format`] when the numbers of names,
-    /// images and matrices differ or an image has not the bytes that its size says.
+    /// [`ErrorKind::Io`](crate::ErrorKind::Io) when the directory or a file cannot be written;
+    /// [`ErrorKind::Format`](crate::ErrorKind::Format) when the numbers of names, images and matrices differ or an image
+    /// has not the bytes that its size says.
     #[cfg(feature = "images")]
     pub fn save(&self, directory: &Path) -> Result<()> {
+        self.save_stamped(directory, None)
+    }
+
+    /// [`Scene::save`] of images that were all taken at `stamp`, in nanoseconds; [`read_stamps`] finds it again.
+    ///
+    /// # Errors
+    /// As [`Scene::save`].
+    #[cfg(feature = "images")]
+    pub fn save_stamped(&self, directory: &Path, stamp: Option<u64>) -> Result<()> {
         if self.names.len() != self.images.len() || self.lidar2img.len() != self.images.len() {
             let (names, images, matrices) = (self.names.len(), self.images.len(), self.lidar2img.len());
             let message =
@@ -199,9 +202,13 @@ impl Scene {
             rgb.chunks_exact_mut(3).for_each(|p| p.swap(0, 2));
             crate::image::png::write_rgb_png(&path, image.width, image.height, &rgb)?;
             let matrix: Vec<&[f32]> = self.lidar2img[index].chunks(4).collect();
-            cameras.push(serde_json::json!({
+            let mut camera = serde_json::json!({
                 "name": name, "file": file, "width": image.width, "height": image.height, "lidar2img": matrix,
-            }));
+            });
+            if let Some(stamp) = stamp {
+                camera["stamp"] = stamp.into();
+            }
+            cameras.push(camera);
         }
         let mut text = serde_json::json!({ "cameras": cameras }).to_string();
         text.push('\n');
@@ -213,7 +220,7 @@ impl Scene {
     /// Checks that every image, padded to multiples of 32, has the size that `network` takes.
     ///
     /// # Errors
-    /// [`ErrorKind::Mismatch`] naming the camera, its size and the expected one.
+    /// [`ErrorKind::Mismatch`](crate::ErrorKind::Mismatch) naming the camera, its size and the expected one.
     pub fn check(&self, network: &Network) -> Result<()> {
         let check = |(name, image): (&String, &Image)| check_padded(name, [image.height, image.width], network);
         self.names.iter().zip(&self.images).try_for_each(check)
@@ -232,20 +239,6 @@ fn check_padded(camera: &str, [height, width]: [usize; 2], network: &Network) ->
     )))
 }
 
-/// The whole file, if it is not longer than `limit` bytes.
-pub(crate) fn read_bounded(path: &Path, limit: u64) -> Result<Vec<u8>> {
-    let file = File::open(path).map_err(|e| Error::io(path, "open", &e))?;
-    let length = file.metadata().map_err(|e| Error::io(path, "read", &e))?.len();
-    if length > limit {
-        let message = format!("file of {length} bytes, expected at most {limit}");
-        return Err(Error::new(ErrorKind::TooLarge, message).in_file(path));
-    }
-    let mut bytes = Vec::new();
-    // A file that grows meanwhile is not followed.
-    file.take(length).read_to_end(&mut bytes).map_err(|e| Error::io(path, "read", &e))?;
-    Ok(bytes)
-}
-
 fn check_count(cameras: usize) -> Result<()> {
     if (1..=MAX_CAMERAS).contains(&cameras) {
         return Ok(());
@@ -253,20 +246,8 @@ fn check_count(cameras: usize) -> Result<()> {
     Err(Error::format(format!("{cameras} cameras, expected 1 to {MAX_CAMERAS}")))
 }
 
-/// Refuses an image without pixels or with a side beyond [`MAX_SIDE`].
-pub(crate) fn check_side(height: usize, width: usize) -> Result<()> {
-    if height == 0 || width == 0 {
-        return Err(Error::format(format!("{height}x{width} (height x width), expected at least one pixel")));
-    }
-    if height > MAX_SIDE || width > MAX_SIDE {
-        let message = format!("{height}x{width} (height x width), expected sides up to {MAX_SIDE}");
-        return Err(Error::new(ErrorKind::TooLarge, message));
-    }
-    Ok(())
-}
-
 /// Refuses a `lidar2img` that is none, and notes one that mirrors.
-fn check_matrix(camera: &str, matrix: &[f32; 16], notes: &mut Vec<Note>) -> Result<()> {
+pub(crate) fn check_matrix(camera: &str, matrix: &[f32; 16], notes: &mut Vec<Note>) -> Result<()> {
     check_finite(camera, matrix)?;
     let rows: [[f64; 4]; 4] = std::array::from_fn(|r| std::array::from_fn(|c| f64::from(matrix[4 * r + c])));
     matrix::check_projection(&rows)
@@ -294,7 +275,7 @@ use crate::image::file::read_image;
 #[cfg(not(feature = "images"))]
 fn read_image(path: &Path, _name: &str, _size: Option<[usize; 2]>, _notes: &mut Vec<Note>) -> Result<Image> {
     let message = "this build reads no image files (feature \"images\"), expected a .safetensors scene";
-    Err(Error::new(ErrorKind::Unsupported, message).in_file(path))
+    Err(Error::new(crate::ErrorKind::Unsupported, message).in_file(path))
 }
 
 #[cfg(test)]

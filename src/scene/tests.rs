@@ -1,4 +1,5 @@
 use super::*;
+use crate::ErrorKind;
 use safetensors::tensor::TensorView;
 
 fn tensors(images: (Dtype, &[usize]), matrices: (Dtype, &[usize]), first: f32) -> Vec<u8> {

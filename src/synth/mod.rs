@@ -56,6 +56,9 @@ pub const CLASSES: [&str; 17] = [
 /// Metres that the ego vehicle drives from one frame of a sequence to the next: 28.8 km/h at two frames a second.
 pub const METRES_PER_FRAME: f32 = 4.0;
 
+/// Nanoseconds from one frame of a sequence to the next.
+pub const NANOSECONDS_PER_FRAME: u64 = 500_000_000;
+
 /// A ring of cameras and a grid, for which frames are made.
 #[derive(Clone, Debug)]
 pub struct Synthesiser {
@@ -69,6 +72,8 @@ pub struct Synthesiser {
 pub struct Frame {
     /// Images and calibration.
     pub scene: Scene,
+    /// When the images are taken: nanoseconds since the sequence began.
+    pub stamp: u64,
     /// Class of every voxel of the network's output grid, `[x, y, z]`, z fastest: of what fills at least a sixth of it
     /// (for people, cones and other small things: of an upright through it), else of the ground's surface in it, else 0.
     pub labels: Vec<u8>,
@@ -138,6 +143,7 @@ impl Synthesiser {
         let visible = labels::visible(&grid, &self.cameras, &views);
         let mut frame = Frame {
             scene: Scene { names: Vec::new(), images: Vec::new(), lidar2img: Vec::new() },
+            stamp: index as u64 * NANOSECONDS_PER_FRAME,
             labels,
             visible,
             pixel_classes: Vec::new(),

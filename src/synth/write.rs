@@ -50,7 +50,7 @@ impl Frame {
         container::write(path, tensors, &BTreeMap::new(), Layout::Packed)
     }
 
-    /// Writes a scene directory: `calibration.json` and images as [`Scene::save`](crate::Scene::save) does, `labels.npz`
+    /// Writes a scene directory: `calibration.json` and images as [`Scene::save_stamped`](crate::Scene::save_stamped) does, `labels.npz`
     /// (`classes` and `visible`, u8 [X, Y, Z]) and `labels.npy` (SurroundOcc's form: i64 rows x, y, z, class of the
     /// voxels that are not empty).
     ///
@@ -58,7 +58,7 @@ impl Frame {
     /// [`ErrorKind::Io`] if the directory or a file cannot be written.
     pub fn save_scene(&self, directory: &Path, grid: [usize; 3]) -> Result<()> {
         use crate::file::npz::{Array, Elements};
-        self.scene.save(directory)?;
+        self.scene.save_stamped(directory, Some(self.stamp))?;
         let array = |name, bytes| Array { name, shape: &grid, elements: Elements::U8(bytes) };
         crate::file::npz::write_npz(
             &directory.join("labels.npz"),

@@ -12,6 +12,7 @@ mod small;
 mod damaged;
 mod drives;
 mod evaluation;
+mod logs;
 mod outside;
 mod results;
 mod usage;

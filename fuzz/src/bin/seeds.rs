@@ -21,6 +21,7 @@ fn main() -> std::io::Result<()> {
         ("checkpoint", checkpoints()),
         ("image", images()),
         ("legacy", legacy()),
+        ("log", logs()),
         ("model", models()),
         ("npz", archives()),
         ("rig", rigs()),
@@ -36,6 +37,37 @@ fn main() -> std::io::Result<()> {
         println!("{}: {} seeds", dir.display(), seeds.len());
     }
     Ok(())
+}
+
+/// A log of one frame.
+fn logs() -> Vec<(String, Vec<u8>)> {
+    use voxcast::log::{Encoded, LogFrame, LogWriter, Shot};
+    use voxcast::session::CameraStatus;
+    let network = voxcast::Network {
+        image: [32, 64],
+        cameras: 1,
+        grids: [[4, 4, 4], [2, 2, 2], [1, 1, 1]],
+        ..voxcast::Network::built_in("edge").expect("built in")
+    };
+    let scene = voxcast::synth::Synthesiser::new(&network).expect("17 classes").frame(1).scene;
+    let path = std::env::temp_dir().join(format!("voxcast-seed-{}.mcap", std::process::id()));
+    let mut log = LogWriter::create(&path, &network).expect("a log");
+    let (classes, support) = ([1; 512], [1; 512]);
+    let occupancy = voxcast::Occupancy {
+        grid: [8; 3],
+        classes: &classes,
+        logits: None,
+        support: &support,
+        cameras: &[CameraStatus::default()],
+    };
+    let file = Encoded::png(&scene.images[0]).expect("a PNG");
+    let shot =
+        Shot { name: &scene.names[0], stamp: 1, file: Some(&file), size: [32, 64], lidar2img: &scene.lidar2img[0] };
+    let frame = LogFrame { stamp: 1, shots: &[shot], occupancy, latency: std::time::Duration::from_millis(1) };
+    log.push(&frame).and_then(|()| log.finish()).expect("written");
+    let bytes = std::fs::read(&path).expect("a log");
+    std::fs::remove_file(&path).expect("removed");
+    vec![("whole".to_owned(), bytes)]
 }
 
 /// Targets whose inputs are shapes and values, which drawn bytes make as well as any others.

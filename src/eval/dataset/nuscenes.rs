@@ -1,5 +1,5 @@
-//! nuScenes v1.0 as it is published (arXiv 1903.11027), with the labels of SurroundOcc (arXiv 2303.09551) or of Occ3D
-//! (arXiv 2304.14365).
+//! nuScenes v1.0 as it is published (arXiv 1903.11027), with the labels of SurroundOcc (arXiv 2303.09551), of Occ3D
+//! (arXiv 2304.14365) or of OpenOcc v2 (arXiv 2306.02851).
 //!
 //! Of the tables, `scene`, `sample`, `sample_data`, `calibrated_sensor`, `ego_pose` and `sensor` are read; of the samples,
 //! the images of the six cameras at key frames. The lidar's sweeps are not read, but frames are in its frame of reference.
@@ -8,17 +8,14 @@ mod labels;
 mod splits;
 mod tables;
 
-use super::{DataSet, Frame, Grid, Pose, Truth};
+use super::{DataSet, Frame, Grid, Pose, Published, Truth};
 use crate::base::error::{Error, Result};
 use crate::image::file::read_image;
 use crate::scene::Scene;
+pub use crate::scene::camera::NUSCENES_RING as CAMERAS;
 use crate::synth::CLASSES;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-
-/// The cameras, in the order of the published networks' training.
-pub const CAMERAS: [&str; 6] =
-    ["CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_FRONT_LEFT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_BACK_RIGHT"];
 
 /// The sensor in whose frame of reference networks see.
 const LIDAR: &str = "LIDAR_TOP";
@@ -30,6 +27,8 @@ pub enum Labels {
     SurroundOcc,
     /// `<scene>/<sample>/labels.npz`: 200 x 200 x 16 voxels of 0.4 m in the ego frame, with the masks `lidar` and `camera`.
     Occ3d,
+    /// `<scene>/<sample>/labels.npz` as Occ3D's, with classes in another order, without "others" and masks.
+    OpenOcc,
 }
 
 /// Which scenes of the tables.
@@ -152,14 +151,22 @@ impl DataSet for NuScenes {
     fn grid(&self) -> Grid {
         match self.labels {
             Labels::SurroundOcc => labels::SURROUNDOCC,
-            Labels::Occ3d => labels::OCC3D,
+            Labels::Occ3d | Labels::OpenOcc => labels::OCC3D,
         }
     }
 
     fn masks(&self) -> &[&'static str] {
         match self.labels {
-            Labels::SurroundOcc => &[],
+            Labels::SurroundOcc | Labels::OpenOcc => &[],
             Labels::Occ3d => &["lidar", "camera"],
+        }
+    }
+
+    fn published(&self) -> Option<Published> {
+        match self.labels {
+            Labels::SurroundOcc => Some(Published::LabelsBrought),
+            Labels::Occ3d => Some(Published::WithOthers { mask: 1 }),
+            Labels::OpenOcc => None,
         }
     }
 
@@ -193,6 +200,11 @@ impl DataSet for NuScenes {
                 let (labels, masks) = labels::read_occ3d(&self.directory.join(&entry.id).join("labels.npz"))?;
                 let origins = vec![entry.lidar_to_ego.origin()];
                 Ok(Truth { labels, masks, origins, grid_to_lidar: entry.lidar_to_ego.inverse() })
+            }
+            Labels::OpenOcc => {
+                let labels = labels::read_openocc(&self.directory.join(&entry.id).join("labels.npz"))?;
+                let origins = vec![entry.lidar_to_ego.origin()];
+                Ok(Truth { labels, masks: vec![], origins, grid_to_lidar: entry.lidar_to_ego.inverse() })
             }
         }
     }

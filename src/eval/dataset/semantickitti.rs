@@ -38,7 +38,8 @@ pub const CLASSES: [&str; 20] = [
     "traffic sign",
 ];
 
-const GRID: Grid = Grid { size: [256, 256, 32], bounds: [[0.0, 51.2], [-25.6, 25.6], [-2.0, 4.4]], axes: Axes::Lidar };
+pub(super) const GRID: Grid =
+    Grid { size: [256, 256, 32], bounds: [[0.0, 51.2], [-25.6, 25.6], [-2.0, 4.4]], axes: Axes::Lidar };
 
 /// The class of a label as it is stored, of the official map; [`IGNORED`] for those that it counts nowhere, none for what is
 /// no label. Moving objects are of the class of those that stand.
@@ -226,7 +227,7 @@ fn numbers(directory: &Path, ending: &str) -> Result<Vec<String>> {
 }
 
 /// The 3x4 matrix of the line `key: ...` of a `calib.txt`.
-fn rows(text: &str, key: &str) -> Result<[[f64; 4]; 3]> {
+pub(super) fn rows(text: &str, key: &str) -> Result<[[f64; 4]; 3]> {
     let mut lines = text.lines().filter_map(|line| line.strip_prefix(key)?.strip_prefix(':'));
     let line = lines.next().ok_or_else(|| Error::format(format!("no line \"{key}:\", expected one of 12 numbers")))?;
     if lines.next().is_some() {
@@ -257,7 +258,7 @@ fn check_matrices(key: &str, camera2img: &[[f64; 4]; 3], lidar2camera: &[[f64; 4
 }
 
 /// Row-major 4x4 of first the rigid `lidar2camera`, then `camera2img`: computed in f64, rounded once.
-fn product(camera2img: &[[f64; 4]; 3], lidar2camera: &[[f64; 4]; 3]) -> [f32; 16] {
+pub(super) fn product(camera2img: &[[f64; 4]; 3], lidar2camera: &[[f64; 4]; 3]) -> [f32; 16] {
     let mut matrix = [0.0; 16];
     matrix[15] = 1.0;
     for (row, factors) in camera2img.iter().enumerate() {

@@ -13,13 +13,9 @@
 
 use super::Contents;
 use super::pickle::{Pickle, Value};
-use super::pth::{self, Source};
+use super::pth::{self, Records, Source};
 use crate::base::error::{Error, ErrorKind, Result};
 use std::collections::HashMap;
-use std::ops::Range;
-
-/// Bytes of the file that each storage has, by its key.
-pub(super) type Records = HashMap<Vec<u8>, Range<usize>>;
 
 /// The number that the first pickle is of, as the pickle writes it.
 const MAGIC: &[u8] = &[0x8a, 10, 0x6c, 0xfc, 0x9c, 0x46, 0xf9, 0x20, 0x6a, 0xa8, 0x50, 0x19];

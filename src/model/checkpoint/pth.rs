@@ -2,11 +2,11 @@
 
 use super::Contents;
 use super::archive::{Archive, Storage};
-use super::legacy::Records;
 use super::pickle::{Id, Pickle, TensorRef, Value};
 use super::tensor::{MAX_DIMS, Tensor};
 use crate::base::error::{Error, ErrorKind, Result};
 use std::collections::HashMap;
+use std::ops::Range;
 
 /// Newest archive version; `torch.save` writes 3, and nothing yet more than this.
 const MAX_VERSION: u32 = 10;
@@ -45,6 +45,9 @@ pub(super) fn list(pickle: &Pickle<'_>, source: Source<'_>) -> Result<Contents> 
     }
     Ok(contents)
 }
+
+/// Bytes of a file that each storage has, by its key.
+pub(super) type Records = HashMap<Vec<u8>, Range<usize>>;
 
 /// Where the storages of a pickle lie.
 pub(super) enum Source<'a> {

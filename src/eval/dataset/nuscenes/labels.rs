@@ -1,9 +1,9 @@
 //! Labels for nuScenes: those of SurroundOcc and of Occ3D, from the files as they are published.
 
-use super::super::{Axes, Grid, IGNORED};
-use crate::base::error::{Error, Result};
+use super::super::arrays::Arrays;
+use super::super::{Axes, Grid, OTHERS};
+use crate::base::error::Result;
 use crate::file::labels::read_rows;
-use crate::file::npz::{OwnedElements, read_npz};
 use crate::synth::CLASSES;
 use std::path::Path;
 
@@ -25,38 +25,33 @@ pub(super) fn read_surroundocc(path: &Path) -> Result<Vec<u8>> {
     read_rows(path, SURROUNDOCC.size, CLASSES.len())
 }
 
-/// Labels of Occ3D, and its masks of what the lidar has observed and of what the cameras have. "Others" (0) counts nowhere.
+/// Labels of Occ3D, and its masks of what the lidar has observed and of what the cameras have. "Others" (0) becomes [`OTHERS`].
 ///
 /// # Errors
 /// Those of [`read_npz`]; [`ErrorKind::Format`](crate::ErrorKind::Format) for a missing array and for one of another type,
 /// shape or range.
 pub(super) fn read_occ3d(path: &Path) -> Result<(Vec<u8>, Vec<Vec<u8>>)> {
-    let mut arrays = read_npz(path)?;
-    let mut take = |name: &str, largest: u8| {
-        let expected = format!("u8 {:?}", OCC3D.size);
-        let failed = |message: String| Error::format(message).in_file(path);
-        let Some(at) = arrays.iter().position(|array| array.name == name) else {
-            return Err(failed(format!("no array \"{name}\", expected {expected}")));
-        };
-        let array = arrays.swap_remove(at);
-        let OwnedElements::U8(values) = array.elements else {
-            return Err(failed(format!("array \"{name}\" is {}, expected {expected}", array.elements.kind())));
-        };
-        if array.shape != OCC3D.size {
-            return Err(failed(format!("array \"{name}\" has shape {:?}, expected {expected}", array.shape)));
-        }
-        match values.iter().position(|&value| value > largest) {
-            Some(at) => Err(failed(format!("array \"{name}\": voxel {at} is {}, expected 0 to {largest}", values[at]))),
-            None => Ok(values),
-        }
-    };
-    let mut labels = take("semantics", FREE)?;
+    let mut arrays = Arrays::read(path)?;
+    let mut labels = arrays.take("semantics", OCC3D.size, FREE)?;
     for label in &mut labels {
         *label = match *label {
-            0 => IGNORED,
+            0 => OTHERS,
             FREE => 0,
             class => class,
         };
     }
-    Ok((labels, vec![take("mask_lidar", 1)?, take("mask_camera", 1)?]))
+    let masks = ["mask_lidar", "mask_camera"].map(|name| arrays.take(name, OCC3D.size, 1));
+    Ok((labels, masks.into_iter().collect::<Result<_>>()?))
+}
+
+/// Classes of OpenOcc v2 in the order of [`CLASSES`], by the number that its labels give them; the last is free.
+const OPENOCC: [u8; 17] = [4, 10, 9, 3, 5, 2, 6, 7, 8, 1, 11, 12, 13, 14, 15, 16, 0];
+
+/// Labels of OpenOcc v2: `semantics` of Occ3D's grid, in an order of its own. The flow is not read.
+///
+/// # Errors
+/// As [`read_occ3d`].
+pub(super) fn read_openocc(path: &Path) -> Result<Vec<u8>> {
+    let labels = Arrays::read(path)?.take("semantics", OCC3D.size, OPENOCC.len() as u8 - 1)?;
+    Ok(labels.into_iter().map(|label| OPENOCC[usize::from(label)]).collect())
 }

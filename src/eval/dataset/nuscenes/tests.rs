@@ -1,4 +1,4 @@
-use super::super::{Axes, IGNORED};
+use super::super::{Axes, IGNORED, OTHERS};
 use super::*;
 use crate::base::error::ErrorKind;
 use crate::file::npz::{Array, Elements, write_npz};
@@ -255,7 +255,7 @@ fn labels_of_occ3d() {
     write(&semantics, whole, &lidar, "mask_camera");
     let truth = place.open(Labels::Occ3d, &Scenes::Val).expect("a set").truth(0).expect("labels");
     let mut expected = vec![0; 640_000];
-    (expected[3], expected[4], expected[639_999]) = (IGNORED, 4, 16);
+    (expected[3], expected[4], expected[639_999]) = (OTHERS, 4, 16);
     assert!(truth.labels == expected && truth.masks == [lidar.clone(), camera.clone()], "other labels");
     assert_eq!(truth.origins, [[1.0, 0.0, 2.0]], "the lidar in the vehicle");
     // (x, y, z) of the vehicle is (-y, x - 1, z - 2) of the lidar.
@@ -282,6 +282,54 @@ fn labels_of_occ3d() {
     said("array \"semantics\" is u16, expected u8 [200, 200, 16]");
     fs::write(&file, "PK").expect("written");
     said("not an .npz");
+}
+
+#[test]
+fn labels_of_openocc() {
+    let place = Place::new();
+    let file = place.root().join("labels/scene-0103/early/labels.npz");
+    fs::create_dir_all(file.parent().expect("a directory")).expect("made");
+    let mut semantics = vec![16u8; 640_000];
+    // By the names that OpenOcc gives its numbers.
+    let names = [
+        "car",
+        "truck",
+        "trailer",
+        "bus",
+        "construction vehicle",
+        "bicycle",
+        "motorcycle",
+        "pedestrian",
+        "traffic cone",
+        "barrier",
+        "driveable surface",
+        "other flat",
+        "sidewalk",
+        "terrain",
+        "manmade",
+        "vegetation",
+        "empty",
+    ];
+    (0..17).for_each(|label| semantics[usize::from(label)] = label);
+    let write = |semantics: &[u8]| {
+        let flow = vec![0.5f32; 8];
+        let arrays = [
+            Array { name: "semantics", shape: &[200, 200, 16], elements: Elements::U8(semantics) },
+            Array { name: "flow", shape: &[2, 2, 2], elements: Elements::F32(&flow) },
+        ];
+        write_npz(&file, &arrays).expect("written");
+    };
+    write(&semantics);
+    let set = place.open(Labels::OpenOcc, &Scenes::Val).expect("a set");
+    let truth = set.truth(0).expect("labels");
+    let found: Vec<&str> = truth.labels[..17].iter().map(|&label| set.classes()[usize::from(label)]).collect();
+    assert_eq!(found, names);
+    assert!(truth.labels[17..].iter().all(|&label| label == 0) && truth.masks.is_empty());
+    assert_eq!((set.masks().len(), set.published(), set.grid().axes), (0, None, Axes::Ego));
+    semantics[9] = 17;
+    write(&semantics);
+    let error = set.truth(0).expect_err("beyond");
+    assert!(error.message().contains("array \"semantics\": voxel 9 is 17, expected 0 to 16"), "{error}");
 }
 
 #[test]

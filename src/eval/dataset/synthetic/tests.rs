@@ -12,8 +12,13 @@ fn network() -> Network {
 /// Writes a frame without the program that usually does.
 fn save(directory: &Path, seed: u64, labels: Vec<u8>, visible: &[u8]) {
     let images: Vec<u8> = (0..2 * 32 * 32 * 3).map(|i| (i * 7 + seed as usize) as u8).collect();
-    let matrix = |shift: f32| [1.0, 0.0, 0.0, shift, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0f32];
-    let matrices: Vec<u8> = [matrix(3.0), matrix(19.0)].as_flattened().iter().flat_map(|v| v.to_le_bytes()).collect();
+    // Unit matrices with shifts that tell them apart.
+    let entry = |i: u16| match i % 16 {
+        0 | 5 | 10 | 15 => 1,
+        3 | 7 | 11 => i,
+        _ => 0,
+    };
+    let matrices: Vec<u8> = (0..32u16).flat_map(|i| f32::from(entry(i)).to_le_bytes()).collect();
     let tensor = |name: &str, dtype, shape: &[usize], bytes: Vec<u8>| Tensor {
         name: name.to_owned(),
         dtype,

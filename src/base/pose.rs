@@ -52,7 +52,7 @@ impl Pose {
 
     /// Row-major 4x4 of a camera that lies so that this pose leads to its frame: points (x, y, z, 1) to (u d, v d, d, 1)
     /// for the rows `intrinsic`. It is computed in f64 and rounded once.
-    pub(super) fn then_project(&self, intrinsic: &[[f64; 3]; 3]) -> [f32; 16] {
+    pub(crate) fn then_project(&self, intrinsic: &[[f64; 3]; 3]) -> [f32; 16] {
         let intrinsic = DMat3::from_cols_array_2d(intrinsic).transpose();
         let (turned, shifted) = (intrinsic * self.rotation, intrinsic * self.shift);
         let mut matrix = [0.0; 16];
