@@ -96,11 +96,14 @@ struct ImageAt {
     place: Place,
 }
 
+/// A topic of calibrations, and since when each holds.
+type Calibrations = (Topic, Vec<(Stamp, Arc<Calibration>)>);
+
 /// What is found while a log is read for the first time.
 #[derive(Default)]
 struct Index {
     images: BTreeMap<String, (Topic, Vec<ImageAt>)>,
-    calibrations: BTreeMap<String, (Topic, Vec<(Stamp, Arc<Calibration>)>)>,
+    calibrations: BTreeMap<String, Calibrations>,
     tree: Tree,
     messages: usize,
 }
@@ -143,7 +146,7 @@ impl Replay {
     /// Reads the log at `path`, which must not be changed while it is open, for `network`. Images are decoded frame by frame.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] if it cannot be opened and mapped; [`ErrorKind::Format`] for malformed records and messages; \
+    /// [`ErrorKind::Io`] if it cannot be opened and mapped; [`ErrorKind::Format`] for malformed records and messages;
     /// [`ErrorKind::Mismatch`] for cameras that are not those of the network, that have no calibration or no way to the
     /// lidar, and for a log in which no frame can be run; [`ErrorKind::Unsupported`] for other compressions and lenses;
     /// [`ErrorKind::TooLarge`] beyond four million messages or a chunk beyond 1 GiB. What is cut off at the end is no error.
@@ -361,7 +364,7 @@ impl Source {
         let size = size_of(&calibration)?;
         let lens = if self.camera.rectified { None } else { Lens::of(&calibration.model, &calibration.d)? };
         let [fx, _, _, _, fy, ..] = calibration.k;
-        if !(fx.is_normal() && fy.is_normal()) && !self.camera.rectified {
+        if !(self.camera.rectified || fx.is_normal() && fy.is_normal()) {
             return Err(Error::format(format!("focal lengths {fx} and {fy}, expected some that are not 0")));
         }
         let (image, file) = match pixels {
