@@ -392,7 +392,7 @@ impl Source {
         let size = size_of(&calibration)?;
         let lens = if self.camera.rectified { None } else { Lens::of(&calibration.model, &calibration.d)? };
         let [fx, _, _, _, fy, ..] = calibration.k;
-        if !self.camera.rectified && !(fx.is_normal() && fy.is_normal()) {
+        if !(self.camera.rectified || fx.is_normal() && fy.is_normal()) {
             return Err(Error::format(format!("focal lengths {fx} and {fy}, expected some that are not 0")));
         }
         let (image, file) = match pixels {

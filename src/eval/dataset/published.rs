@@ -143,7 +143,7 @@ mod tests {
         assert_eq!([1, 2, 3].map(|class| counts.class_iou(class)), [Some(1.0), Some(0.5), Some(1.0)]);
         assert_eq!((counts.count(0, 2), counts.voxels()), (16, 80));
         // A class that is nowhere counts as 0.
-        let (_, _, counts) = score(fine, Published::LabelsBrought, &vec![1; 32], &vec![1; 80]);
+        let (_, _, counts) = score(fine, Published::LabelsBrought, &[1; 32], &[1; 80]);
         assert_eq!((counts.mean_iou(), Published::LabelsBrought.mean_iou(&counts)), (Some(1.0), Some(1.0 / 3.0)));
         let moved = Grid { bounds: [[-4.0, 4.0], [-4.0, 4.0], [-1.5, 0.5]], ..fine };
         let (published, _, counts) = score(moved, Published::LabelsBrought, &labels, &classes);
