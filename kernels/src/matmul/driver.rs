@@ -16,7 +16,7 @@ use crate::simd::{LANES, Simd};
 use core::marker::PhantomData;
 use core::ops::Range;
 
-/// Rows of a block: with [`depth`] values each they take under a third of a 512 KiB second-level cache. A multiple of every
+/// Rows of a block: with `depth` values each they take under a third of a 512 KiB second-level cache. A multiple of every
 /// tile's rows, so that whole blocks are whole tiles.
 pub const BLOCK_ROWS: usize = 96;
 /// Bytes of the panels that a tile reads in one k block: three quarters of a 32 KiB first-level cache.
