@@ -1,6 +1,6 @@
 //! `voxcast run` over the scenes of a drive, with one session.
 
-use super::frame::{self, Moving};
+use super::frame;
 use super::run::{Run, digest, draw, masked, title, write};
 use super::terminal;
 use std::collections::{BTreeSet, HashMap};
@@ -8,7 +8,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use voxcast::picture::Animation;
-use voxcast::{Error, Model, Result, Scene, SessionOptions};
+use voxcast::session::Moving;
+use voxcast::{Error, Model, Result, Rig, Scene, SessionOptions};
 
 /// The scenes in `path`, in the order of their names, if it is a directory of scenes rather than a scene: directories
 /// with a calibration.json, and .safetensors files.
@@ -157,7 +158,8 @@ struct Driver {
 
 impl Driver {
     fn new(run: &Run, model: &Arc<Model>, scene: &Scene, options: &SessionOptions) -> Result<Self> {
-        Ok(Self { moving: Moving::new(model, run.rig.as_deref(), scene, options)?, masked: BTreeSet::new() })
+        let rig = run.rig.as_deref().map(|path| Rig::open(path, model.network(), scene.cameras())).transpose()?;
+        Ok(Self { moving: Moving::new(model, rig, scene, options)?, masked: BTreeSet::new() })
     }
 
     /// Makes the session ready for a scene: builds the matrices anew where its cameras have moved, and masks those that

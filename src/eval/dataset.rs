@@ -3,11 +3,13 @@
 //! A [`DataSet`] is a list of frames that can be read in any order, from several threads at once; nothing is kept between
 //! frames but the index. Labels are classes of the network's training, [`IGNORED`] where there is no truth.
 
+mod named;
 pub mod nuscenes;
 mod pose;
 pub mod semantickitti;
 mod synthetic;
 
+pub use named::{FORMS, Named};
 pub use nuscenes::NuScenes;
 pub use pose::Pose;
 pub use semantickitti::SemanticKitti;

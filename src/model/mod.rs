@@ -156,9 +156,26 @@ impl Model {
         self.path.as_deref()
     }
 
-    /// Bytes of the file.
+    /// Writes the model to `path`, as it is, by way of a temporary file beside it.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Io`](crate::ErrorKind::Io) if the system refuses.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        let tensors = self.contents().map(|(name, dtype, shape, bytes)| {
+            let shape = shape.to_vec();
+            Tensor { name, dtype, shape, data: Data::Bytes(bytes) }
+        });
+        crate::file::container::write(path, tensors.collect(), self.metadata(), LAYOUT)
+    }
+
+    /// The bytes of the file.
+    pub fn bytes(&self) -> &[u8] {
+        self.container.bytes()
+    }
+
+    /// How many bytes the file has.
     pub fn file_size(&self) -> usize {
-        self.container.bytes().len()
+        self.bytes().len()
     }
 
     /// The file's checksum.
@@ -278,12 +295,7 @@ pub(crate) fn tensor<'a>(name: String, part: &Part, precision: Precision, data: 
 /// # Errors
 /// [`ErrorKind::Io`] if the system refuses; [`ErrorKind::Format`] for bytes that are no model.
 pub fn write_bytes(path: &Path, bytes: &'static [u8]) -> Result<()> {
-    let model = Model::from_bytes(bytes)?;
-    let tensors = model.contents().map(|(name, dtype, shape, bytes)| {
-        let shape = shape.to_vec();
-        Tensor { name, dtype, shape, data: Data::Bytes(bytes) }
-    });
-    crate::file::container::write(path, tensors.collect(), model.metadata(), LAYOUT)
+    Model::from_bytes(bytes)?.save(path)
 }
 
 /// A model file's metadata.

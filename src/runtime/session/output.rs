@@ -55,6 +55,31 @@ impl Occupancy<'_> {
     }
 }
 
+/// A result that has left its session ([`Session::take`](super::Session::take)).
+#[derive(Debug)]
+pub struct OwnedOccupancy {
+    grid: [usize; 3],
+    output: Output,
+    keep_logits: bool,
+}
+
+impl OwnedOccupancy {
+    pub(super) fn new(grid: [usize; 3], output: Output, keep_logits: bool) -> Self {
+        Self { grid, output, keep_logits }
+    }
+
+    /// The result.
+    pub fn view(&self) -> Occupancy<'_> {
+        let Output { classes, logits, support, cameras, .. } = &self.output;
+        let logits = self.keep_logits.then_some(&logits[..]);
+        Occupancy { grid: self.grid, classes, logits, support, cameras }
+    }
+
+    pub(super) fn into_output(self) -> Output {
+        self.output
+    }
+}
+
 /// The memory of one result. A session has two: the last complete one, and the one that is being written.
 #[derive(Debug)]
 pub(super) struct Output {
@@ -77,6 +102,17 @@ impl Output {
             cameras: zeros(cameras)?,
             sight: 0,
         })
+    }
+
+    /// As much memory as `other` has, zeros, unless the system has none.
+    pub(super) fn like(other: &Self) -> Option<Self> {
+        Self::new(other.classes.len(), other.logits.len(), other.cameras.len())
+    }
+
+    /// Whether it has as much memory as `other`.
+    pub(super) fn fits(&self, other: &Self) -> bool {
+        let lengths = |o: &Self| [o.classes.len(), o.logits.len(), o.support.len(), o.cameras.len()];
+        lengths(self) == lengths(other)
     }
 
     /// Bytes that [`Output::new`] takes, unless they cannot be counted.

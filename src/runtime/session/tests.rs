@@ -128,3 +128,33 @@ fn events_come_in_running_order() {
     assert_eq!(session.cameras(), 2);
     assert!(format!("{session:?}").starts_with("Session"));
 }
+
+#[test]
+fn results_that_are_taken_out_stay_and_lend_their_memory() {
+    let mut session = session();
+    let images = [3u8, 200].map(|value| vec![value; 32 * 64 * 3]);
+    let frame = |which: usize| [ImageView::bgr(32, 64, &images[which]); 2];
+    assert!(session.take(None).expect("nothing to allocate").is_none());
+    let expected = [0, 1].map(|which| session.run(&frame(which)).expect("a frame").digest());
+    assert_ne!(expected[0], expected[1], "images that can be told apart");
+
+    session.set_cameras(&frame(0)).expect("sound images");
+    assert_eq!(session.step(Budget::Unlimited), Step::Complete);
+    let first = session.take(None).expect("memory").expect("a result");
+    assert!(session.occupancy().is_none() && session.take(None).expect("nothing to allocate").is_none());
+    let place = first.view().classes.as_ptr();
+    // A frame that was begun is dropped.
+    session.set_camera(0, frame(0)[0]).expect("sound images");
+    assert_eq!(session.step(Budget::Slices(1)), Step::Running);
+    session.set_cameras(&frame(1)).expect("sound images");
+    assert_eq!(session.step(Budget::Unlimited), Step::Complete);
+    assert_eq!([first.view().digest(), session.occupancy().expect("a result").digest()], expected);
+    assert_eq!(first.view().grid, [16, 8, 8]);
+
+    let second = session.take(Some(first)).expect("memory").expect("a result");
+    assert_eq!(second.view().digest(), expected[1]);
+    // The memory comes back as the one that is read, after one that is written.
+    let places = [0, 1].map(|which| session.run(&frame(which)).expect("a frame").classes.as_ptr());
+    assert!(places.contains(&place));
+    assert_eq!(second.view().digest(), expected[1]);
+}

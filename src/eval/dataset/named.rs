@@ -1,12 +1,12 @@
-//! Data sets as they are named on the command line.
+//! Data sets by name, as on the command line.
 
+use super::nuscenes::{Labels, Scenes};
+use super::semantickitti::Split;
+use super::{DataSet, NuScenes, SemanticKitti, Synthetic};
+use crate::base::error::Result;
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
-use voxcast::Result;
-use voxcast::dataset::nuscenes::{Labels, Scenes};
-use voxcast::dataset::semantickitti::Split;
-use voxcast::dataset::{DataSet, NuScenes, SemanticKitti, Synthetic};
 
 /// How sets are named, for help texts.
 pub const FORMS: &str = "\
@@ -23,9 +23,9 @@ SPLIT: val (08, the default), train, test, or a sequence such as 05. stereo adds
 const EXPECTED: &str = "expected synthetic:DIR, surroundocc:ROOT:LABELS[:SCENES], occ3d:ROOT:LABELS[:SCENES] or \
                         semantickitti:ROOT[:SPLIT[:stereo]]";
 
-/// A data set, not yet opened.
+/// A data set by its name, not yet opened. [`FORMS`] has the names.
 #[derive(Clone, Debug)]
-pub struct Source {
+pub struct Named {
     /// As it was named.
     text: String,
     kind: Kind,
@@ -38,7 +38,7 @@ enum Kind {
     SemanticKitti { root: PathBuf, split: Split, stereo: bool },
 }
 
-impl FromStr for Source {
+impl FromStr for Named {
     type Err = String;
 
     fn from_str(text: &str) -> std::result::Result<Self, String> {
@@ -75,14 +75,17 @@ fn kitti(root: &str, split: Split, stereo: bool) -> Kind {
     Kind::SemanticKitti { root: root.into(), split, stereo }
 }
 
-impl fmt::Display for Source {
+impl fmt::Display for Named {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.text)
     }
 }
 
-impl Source {
+impl Named {
     /// Opens the set.
+    ///
+    /// # Errors
+    /// Those of the set, naming the file that is missing or malformed.
     pub fn open(&self) -> Result<Box<dyn DataSet>> {
         Ok(match &self.kind {
             Kind::Synthetic(directory) => Box::new(Synthetic::open(directory)?),
@@ -100,7 +103,7 @@ mod tests {
     use std::path::Path;
 
     fn kind(text: &str) -> Kind {
-        text.parse::<Source>().expect(text).kind
+        text.parse::<Named>().expect(text).kind
     }
 
     #[test]
@@ -122,15 +125,15 @@ mod tests {
         ] {
             let Kind::SemanticKitti { split, stereo, .. } = kind(text) else { panic!("SemanticKITTI") };
             assert_eq!((split, stereo), expected, "{text}");
-            assert_eq!(text.parse::<Source>().expect(text).to_string(), text);
+            assert_eq!(text.parse::<Named>().expect(text).to_string(), text);
         }
     }
 
     #[test]
     fn what_names_no_set_is_refused() {
         for text in ["", "dir", "cifar:x", "surroundocc:n", "occ3d:n:g:val:x", "semantickitti:k:val:mono"] {
-            assert_eq!(text.parse::<Source>().expect_err(text), EXPECTED);
+            assert_eq!(text.parse::<Named>().expect_err(text), EXPECTED);
         }
-        assert!("semantickitti:k:23".parse::<Source>().expect_err("23").contains("a sequence 00 to 21"));
+        assert!("semantickitti:k:23".parse::<Named>().expect_err("23").contains("a sequence 00 to 21"));
     }
 }
