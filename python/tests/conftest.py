@@ -9,7 +9,7 @@ import pytest
 
 import voxcast
 
-FRAMES = 8
+FRAMES = 6
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ from ray.cluster_utils import Cluster
 import voxcast
 import voxcast.ray
 
-FRAMES = 8
+FRAMES = 6
 
 
 @pytest.fixture

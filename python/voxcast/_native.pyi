@@ -8,6 +8,26 @@ from typing import Any, Literal, final
 import numpy as np
 from numpy.typing import NDArray
 
+__all__ = [
+    "CameraStatus",
+    "Evaluation",
+    "Memory",
+    "Model",
+    "Occupancy",
+    "Page",
+    "Report",
+    "Rig",
+    "Scene",
+    "Session",
+    "Worker",
+    "__version__",
+    "import_file",
+    "import_tensors",
+    "merge",
+    "network_json",
+    "view",
+]
+
 __version__: str
 
 _Path = str | PathLike[str]

@@ -159,7 +159,7 @@ class _Runner:
 
     def __init__(self, model: Model, logits: bool, threads: int) -> None:
         self.model, self.logits, self.threads = model, logits, threads
-        self.calibration: NDArray[numpy.float32] | None = None
+        self.calibration = numpy.empty((0, 4, 4), numpy.float32)
         self.session: Session | None = None
 
     def ready(self) -> str:
@@ -217,8 +217,8 @@ class _Crew(Generic[Item, Value]):
         """What is awaited of which actor; without a job, its first answer."""
         self.stillborn = 0
         """Actors in a row that were lost before they answered."""
-        for _ in range(count):
-            self.hire()
+        self.expected = {self.hire() for _ in range(count)}
+        """Actors for which the cluster had room, and which have not answered. Those that replace lost ones may never."""
 
     def __enter__(self) -> _Crew[Item, Value]:
         return self
@@ -227,9 +227,10 @@ class _Crew(Generic[Item, Value]):
         for actor in {*self.idle, *(actor for actor, _ in self.running.values())}:
             ray.kill(actor)
 
-    def hire(self) -> None:
+    def hire(self) -> Any:
         actor = self.kind.remote(*self.arguments)
         self.running[actor.ready.remote()] = (actor, None)
+        return actor
 
     def compute(
         self, items: Sequence[Item], checked: set[int], essence: Callable[[Value], object]
@@ -242,18 +243,20 @@ class _Crew(Generic[Item, Value]):
         while True:
             self.assign(jobs, again)
             busy = any(job is not None for _, job in self.running.values())
-            if not jobs and not busy:
+            late = time.monotonic() - heard > self.patience
+            if not jobs and not busy and (not again or not self.expected or late):
                 # What is left to compare has no node but the first.
-                for job in again:
-                    logger.warning("frame %s is not compared: no second node", job.item)
+                for left in again:
+                    logger.warning("frame %s is not compared: no second node", left.item)
                 return
+            if not busy and late:
+                raise UnsupportedError(f"no actor could run for {self.patience:.0f} s: the cluster has no room")
             ready, _ = ray.wait(list(self.running), timeout=TICK)
             if ready or busy:
                 heard = time.monotonic()
-            elif time.monotonic() - heard > self.patience:
-                raise UnsupportedError(f"no actor could run for {self.patience:.0f} s: the cluster has no room")
             for reference in ready:
                 actor, job = self.running.pop(reference)
+                self.expected.discard(actor)
                 try:
                     value = ray.get(reference)
                 except (RayActorError, ObjectLostError) as error:
@@ -278,8 +281,9 @@ class _Crew(Generic[Item, Value]):
         """Gives idle actors work: first what is to be compared and was computed on another node."""
         for actor in list(self.idle):
             node = self.nodes[actor]
-            job = next((job for job in again if job.first is not None and job.first[1] != node), None)
-            if job is not None:
+            elsewhere = next((job for job in again if job.first is not None and job.first[1] != node), None)
+            if elsewhere is not None:
+                job = elsewhere
                 again.remove(job)
             elif jobs:
                 job = jobs.popleft()
