@@ -168,18 +168,8 @@ pub(crate) fn network_json(name: &str) -> Outcome<String> {
 
 /// Imports a checkpoint file.
 #[pyfunction]
-#[pyo3(signature = (checkpoint, network, output, precision, fold, self_test, threads))]
-pub(crate) fn import_file(
-    py: Python<'_>,
-    checkpoint: PathBuf,
-    network: &str,
-    output: Option<PathBuf>,
-    precision: &str,
-    fold: &str,
-    self_test: bool,
-    threads: Option<usize>,
-) -> Outcome<Model> {
-    let plan = Plan::new(network, output, precision, fold, self_test, threads)?;
+pub(crate) fn import_file(py: Python<'_>, checkpoint: PathBuf, wish: Wish) -> Outcome<Model> {
+    let plan = wish.plan()?;
     py.detach(|| {
         let source = Checkpoint::open(&checkpoint)?;
         plan.import(&source).map_err(|failure| match failure {
@@ -191,24 +181,19 @@ pub(crate) fn import_file(
 
 /// Imports a dict of float32 or float64 arrays.
 #[pyfunction]
-#[pyo3(signature = (tensors, network, output, precision, fold, self_test, threads))]
-pub(crate) fn import_tensors(
-    py: Python<'_>,
-    tensors: &Bound<'_, PyDict>,
-    network: &str,
-    output: Option<PathBuf>,
-    precision: &str,
-    fold: &str,
-    self_test: bool,
-    threads: Option<usize>,
-) -> Outcome<Model> {
-    let plan = Plan::new(network, output, precision, fold, self_test, threads)?;
+pub(crate) fn import_tensors(py: Python<'_>, tensors: &Bound<'_, PyDict>, wish: Wish) -> Outcome<Model> {
+    let plan = wish.plan()?;
     let mut source = Tensors(HashMap::new());
     for (name, array) in tensors {
         source.0.insert(name.extract()?, Numbers::of(&array)?);
     }
     py.detach(|| plan.import(&source))
 }
+
+/// How a model is to be made, as `import_checkpoint` hands it on: the network as JSON, the output, precision, fold, whether
+/// there is to be a self-test, and on how many threads.
+#[derive(FromPyObject)]
+pub(crate) struct Wish(String, Option<PathBuf>, String, String, bool, Option<usize>);
 
 /// How a model is made, and where it goes.
 struct Plan {
@@ -218,31 +203,27 @@ struct Plan {
     self_test: Option<voxcast::Threads>,
 }
 
-impl Plan {
-    fn new(
-        network: &str,
-        output: Option<PathBuf>,
-        precision: &str,
-        fold: &str,
-        self_test: bool,
-        threads: Option<usize>,
-    ) -> Outcome<Self> {
-        let network = Network::from_json(network)?;
+impl Wish {
+    fn plan(self) -> Outcome<Plan> {
+        let Self(network, output, precision, fold, self_test, threads) = self;
         let one_of = |what: &str, found: &str, expected: &str| {
             Failure::Python(PyTypeError::new_err(format!("{what}: found {found:?}, expected {expected}")))
         };
-        let precision =
-            Precision::parse(precision).ok_or_else(|| one_of("precision", precision, "\"f32\" or \"f16\""))?;
-        let rewrites = match fold {
+        let network = Network::from_json(&network)?;
+        let unknown = || one_of("precision", &precision, "\"f32\" or \"f16\"");
+        let precision = Precision::parse(&precision).ok_or_else(unknown)?;
+        let rewrites = match fold.as_str() {
             "all" => Rewrites::ALL,
             "batch-norm" => Rewrites { projection: false, ..Rewrites::ALL },
             "none" => Rewrites::NONE,
             other => return Err(one_of("fold", other, "\"all\", \"batch-norm\" or \"none\"")),
         };
         let self_test = self_test.then(|| machine::threads(threads)).transpose()?;
-        Ok(Self { network, options: Options { precision, rewrites }, output, self_test })
+        Ok(Plan { network, options: Options { precision, rewrites }, output, self_test })
     }
+}
 
+impl Plan {
     fn import(&self, source: &dyn Source) -> Outcome<Model> {
         let progress = &mut |_, _| ();
         let Some(output) = &self.output else {

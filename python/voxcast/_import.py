@@ -37,11 +37,11 @@ def import_checkpoint(
     """
     text = _network(network)
     target = None if output is None else os.fspath(output)
-    options = (text, target, precision, fold, self_test, threads)
+    wish = (text, target, precision, fold, self_test, threads)
     if isinstance(checkpoint, (str, os.PathLike)):
-        return _native.import_file(os.fspath(checkpoint), *options)
+        return _native.import_file(os.fspath(checkpoint), wish)
     state = checkpoint if isinstance(checkpoint, Mapping) else checkpoint.state_dict()
-    return _native.import_tensors(_tensors(state), *options)
+    return _native.import_tensors(_tensors(state), wish)
 
 
 def _network(network: Any) -> str:

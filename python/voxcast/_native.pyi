@@ -33,6 +33,7 @@ __version__: str
 _Path = str | PathLike[str]
 _Isa = Literal["scalar", "avx2", "avx512"]
 _Order = Literal["bgr", "rgb"]
+_Wish = tuple[str, str | None, str, str, bool, int | None]
 _Images = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 
 @final
@@ -247,21 +248,5 @@ def view(
 ) -> Page: ...
 def merge(journals: Sequence[_Path], *, limit: int | None = None) -> Report: ...
 def network_json(name: str) -> str: ...
-def import_file(
-    checkpoint: _Path,
-    network: str,
-    output: _Path | None,
-    precision: str,
-    fold: str,
-    self_test: bool,
-    threads: int | None,
-) -> Model: ...
-def import_tensors(
-    tensors: dict[str, NDArray[Any]],
-    network: str,
-    output: _Path | None,
-    precision: str,
-    fold: str,
-    self_test: bool,
-    threads: int | None,
-) -> Model: ...
+def import_file(checkpoint: _Path, wish: _Wish) -> Model: ...
+def import_tensors(tensors: dict[str, NDArray[Any]], wish: _Wish) -> Model: ...
