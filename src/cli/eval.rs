@@ -1,23 +1,18 @@
 //! `voxcast eval`
 
-use super::scoring::{self, Means, Predictor, Says};
-use super::source::{FORMS, Source};
+use super::shard::ShardArgument;
 use super::{Machine, frame, terminal};
 use clap::Args;
-use serde_json::json;
-use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
-use voxcast::dataset::DataSet;
-use voxcast::eval::{
-    Comparison, Confusion, FrameScore, Journal, Options, Report, Scorer, Totals, majority, write_text,
-};
-use voxcast::picture::{Matrix, Palette, draw_matrix};
+use voxcast::dataset::{DataSet, FORMS, Named};
+use voxcast::eval::{Evaluation, Means, Predictor, Says, Scope, Shard, Summary, majority, write_text};
 use voxcast::{Error, Model, Result};
 
 /// Score a model on a data set with labels: IoU, mIoU and every class, near and far, seen and unseen.
 ///
-/// With --compare, two models are scored on the same frames and set against each other.
+/// With --compare, two models are scored on the same frames and set against each other. With --shard, this machine scores
+/// a part of the frames, and --merge puts the parts together.
 #[derive(Args, Debug)]
 #[command(after_help = format!("\
 Examples:
@@ -29,20 +24,25 @@ Examples:
   voxcast eval --model model.safetensors --data surroundocc:nuscenes:nuscenes_occ:val
   voxcast eval --model model.safetensors --data semantickitti:kitti:08
 
+Many machines, here the third of eight; then, once all have ended, the numbers of one run:
+  voxcast eval --model model.safetensors --data synthetic:heldout --shard 2/8 --resume shard-2.jsonl
+  voxcast eval --merge shard-*.jsonl --json scores.json
+
 {FORMS}"))]
 pub struct Eval {
     /// The model
-    #[arg(long, required_unless_present_any = ["majority", "compare"], conflicts_with_all = ["majority", "compare"])]
+    #[arg(long, required_unless_present_any = ["majority", "compare", "merge"],
+        conflicts_with_all = ["majority", "compare"])]
     model: Option<PathBuf>,
     /// Score two models, and compare what they say class by class
     #[arg(long, value_names = ["A", "B"], num_args = 2, action = clap::ArgAction::Set, conflicts_with = "majority")]
     compare: Vec<PathBuf>,
     /// Instead of a model, predict in each voxel the class that is most frequent there in another set
     #[arg(long, value_name = "SET")]
-    majority: Option<Source>,
+    majority: Option<Named>,
     /// The data set, as below: synthetic:DIR, surroundocc:..., occ3d:..., semantickitti:... and others
-    #[arg(long, value_name = "SET")]
-    data: Source,
+    #[arg(long, value_name = "SET", required_unless_present = "merge")]
+    data: Option<Named>,
     /// Only the first N frames
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     limit: Option<u32>,
@@ -56,6 +56,14 @@ pub struct Eval {
     /// --limit
     #[arg(long, value_name = "FILE")]
     resume: Option<PathBuf>,
+    /// Score frames I, I + N, I + 2N, ... only, as one of N machines that share the set. auto takes I and N from a Slurm
+    /// array, or from a Kubernetes Indexed Job that sets JOB_COMPLETIONS
+    #[arg(long, value_name = "I/N|auto", requires = "resume")]
+    shard: Option<ShardArgument>,
+    /// Instead of scoring, put together what --resume kept for each shard. Takes --limit, if the shards had it
+    #[arg(long, value_name = "JOURNAL", num_args = 1..,
+        conflicts_with_all = ["model", "compare", "majority", "data", "losses", "resume", "shard"])]
+    merge: Vec<PathBuf>,
     /// Draw the confusion matrix; with --compare, of A's classes with B's
     #[arg(long, value_name = "FILE.png")]
     confusion: Option<PathBuf>,
@@ -75,155 +83,86 @@ impl Eval {
             frame::check_output(path)?;
         }
         self.check_apart()?;
-        let set = self.data.open()?;
-        let options = Options::default();
-        let predictors = self.predictors(&*set, &options)?;
-        let count = self.limit.map_or(set.len(), |limit| set.len().min(limit as usize));
-        let kind = predictors[0].scorer.kind();
-        let mut totals = Totals::new(kind, predictors.len(), count);
-        let journal = match &self.resume {
-            Some(path) => Some(self.journal(path, &*set, &predictors, &options, &mut totals, count)?),
-            None => None,
+        let limit = self.limit.map(|limit| limit as usize);
+        match &self.data {
+            Some(data) => self.report(&self.score(data, limit)?),
+            // clap has seen to it that there are journals.
+            None => self.report(&Summary::merge(&self.merge, limit)?),
+        }
+    }
+
+    fn score(&self, data: &Named, limit: Option<usize>) -> Result<Summary> {
+        let shard = match &self.shard {
+            Some(shard) => shard.resolve(&|name| std::env::var(name).ok())?,
+            None => Shard::WHOLE,
         };
+        let set = data.open()?;
+        let predictors = self.predictors(&*set, data)?;
+        let scope = Scope { losses: self.losses, limit, shard, ..Scope::default() };
+        let evaluation = Arc::new(Evaluation::new(set, &data.to_string(), predictors, &scope)?);
+        let mut totals = evaluation.totals();
+        let mut journal = self.resume.as_deref().map(|path| evaluation.resume(path, &mut totals)).transpose()?;
         let means = Means {
             workers: usize::from(self.workers),
             threads: self.machine.threads.count(),
             isa: self.machine.isa()?,
-            losses: self.losses,
         };
-        let totals = scoring::score(&*set, &predictors, &means, totals, journal, count)?.finish();
-        self.report(&*set, &predictors, &options, &totals, count)
+        let bar = terminal::progress("scoring", evaluation.left(&totals).len());
+        evaluation.run(&means, &mut totals, journal.as_mut(), &mut |done| {
+            bar.set_position(done as u64);
+            Ok(())
+        })?;
+        bar.finish_and_clear();
+        Ok(evaluation.summary(totals))
     }
 
-    /// Refuses two outputs in one file, of which the last would be left: a report in the place of hours of scores.
+    /// Refuses an output in the place of another or of a journal, of which the last would be left: a report in the place of
+    /// hours of scores.
     fn check_apart(&self) -> Result<()> {
         let mut taken: Vec<(&str, PathBuf)> = Vec::new();
-        for (flag, path) in [
+        let merged = self.merge.iter().map(|path| ("--merge", path));
+        let outputs = [
             ("--resume", &self.resume),
             ("--json", &self.json),
             ("--markdown", &self.markdown),
             ("--confusion", &self.confusion),
-        ] {
-            let Some(path) = path else { continue };
+        ];
+        for (flag, path) in merged.chain(outputs.iter().filter_map(|(flag, path)| Some((*flag, path.as_ref()?)))) {
             let place = std::path::absolute(path).map_err(|e| Error::io(path, "find", &e))?;
             let place = std::fs::canonicalize(&place).unwrap_or(place);
             if let Some((other, _)) = taken.iter().find(|(_, other)| *other == place) {
-                return Err(Error::mismatch(format!("{other} and {flag} write the same file")).in_file(path));
+                return Err(Error::mismatch(format!("{other} and {flag} name the same file")).in_file(path));
             }
             taken.push((flag, place));
         }
         Ok(())
     }
 
-    fn predictors(&self, set: &dyn DataSet, options: &Options) -> Result<Vec<Predictor>> {
-        let predictor = |name: String, says: Says, always| -> Result<Predictor> {
-            let grid = says.grid(always);
-            let scorer = Scorer::new(set.classes().len(), set.masks().len(), set.grid(), grid, options)?;
-            let scorer = scorer.with_published(set.published());
-            Ok(Predictor { name, says, scorer })
-        };
+    fn predictors(&self, set: &dyn DataSet, data: &Named) -> Result<Vec<Predictor>> {
         if let Some(source) = &self.majority {
             let other = source.open()?;
             if other.classes() != set.classes() {
-                return Err(Error::mismatch(format!("{source} has other classes than {}", self.data)));
+                return Err(Error::mismatch(format!("{source} has other classes than {data}")));
             }
             let bar = terminal::progress("counting", other.len());
             let classes = majority(&*other, &mut |done| bar.set_position(done as u64))?;
             bar.finish_and_clear();
-            return Ok(vec![predictor(format!("majority of {source}"), Says::Always(classes), other.grid())?]);
+            let says = Says::Always(classes, other.grid());
+            return Ok(vec![Predictor { name: format!("majority of {source}"), says }]);
         }
-        let open = |path: &PathBuf| {
-            let model = Model::open(path)?;
-            let (found, expected) = (model.network().classes, set.classes().len());
-            if found != expected {
-                let message = format!("a model of {found} classes, {} has {expected}", self.data);
-                return Err(Error::mismatch(message).in_file(path));
-            }
-            predictor(path.display().to_string(), Says::Model(Arc::new(model)), set.grid())
-        };
-        self.model.iter().chain(&self.compare).map(open).collect()
+        self.model.iter().chain(&self.compare).map(|path| Ok(Predictor::model(Arc::new(Model::open(path)?)))).collect()
     }
 
-    /// Opens the journal and counts the frames that it has.
-    fn journal(
-        &self,
-        path: &Path,
-        set: &dyn DataSet,
-        predictors: &[Predictor],
-        options: &Options,
-        totals: &mut Totals,
-        count: usize,
-    ) -> Result<Journal> {
-        let what = json!({
-            "data": self.data.to_string(),
-            "predictors": predictors.iter().map(|predictor| predictor.says.identity()).collect::<Vec<_>>(),
-            "grid": { "size": set.grid().size, "bounds": set.grid().bounds },
-            "classes": set.classes(),
-            "masks": set.masks(),
-            "losses": self.losses,
-            "rings": options.rings,
-            "version": env!("CARGO_PKG_VERSION"),
-        });
-        let index_of: HashMap<&str, usize> = (0..count).map(|index| (set.id(index), index)).collect();
-        Journal::open(path, &what, predictors[0].scorer.kind(), predictors.len(), &mut |frame, score| {
-            if let Some(&index) = index_of.get(frame).filter(|&&index| !totals.has(index)) {
-                totals.add(index, score);
-            }
-        })
-    }
-
-    fn report(
-        &self,
-        set: &dyn DataSet,
-        predictors: &[Predictor],
-        options: &Options,
-        totals: &FrameScore,
-        frames: usize,
-    ) -> Result<()> {
-        let (data, regions) = (self.data.to_string(), Scorer::regions(set.masks()));
-        let titles: Vec<String> = predictors.iter().map(|predictor| format!("{} on {data}", predictor.name)).collect();
-        let reports: Vec<Report<'_>> = titles
-            .iter()
-            .zip(&totals.scores)
-            .zip(predictors)
-            .map(|((title, total), predictor)| Report {
-                title,
-                classes: set.classes(),
-                regions: &regions,
-                rings: &options.rings,
-                published: predictor.scorer.published(),
-                frames,
-                total,
-            })
-            .collect();
-        let sums: Vec<Confusion> = totals.scores.iter().map(|score| score.region(0)).collect();
-        let names = || Some([predictors.first()?.name.as_str(), predictors.get(1)?.name.as_str()]);
-        let comparison = names().and_then(|names| Comparison::of(names, &data, set.classes(), frames, &sums, totals));
-        let (text, markdown, json) = match &comparison {
-            None => (reports[0].text(), reports[0].markdown(), reports[0].json()),
-            Some(comparison) => {
-                let [a, b] = [&reports[0], &reports[1]];
-                let json = json!({ "comparison": comparison.json(), "reports": [a.json(), b.json()] });
-                let markdown = [comparison.markdown(), a.markdown(), b.markdown()].join("\n");
-                (comparison.text(), markdown, json)
-            }
-        };
-        print!("{text}");
+    fn report(&self, summary: &Summary) -> Result<()> {
+        print!("{}", summary.text());
         if let Some(path) = &self.json {
-            write_text(path, &format!("{json:#}\n"))?;
+            summary.write_json(path)?;
         }
         if let Some(path) = &self.markdown {
-            write_text(path, &markdown)?;
+            write_text(path, &summary.markdown())?;
         }
         if let Some(path) = &self.confusion {
-            let palette = Palette::of(set.classes().len());
-            let (counts, rows, columns, title) = match &comparison {
-                None => (sums[0].counts(), "Truth", "Prediction", titles[0].clone()),
-                Some(c) => (c.agreement.counts(), "A", "B", format!("A: {}, B: {}, on {data}", c.names[0], c.names[1])),
-            };
-            let subtitle = format!("{frames} frames; shares of each row in per cent");
-            let matrix = Matrix { title: &title, subtitle: &subtitle, rows, columns, counts, palette: &palette };
-            draw_matrix(&matrix)?.write_png(path)?;
+            summary.write_confusion(path)?;
         }
         Ok(())
     }

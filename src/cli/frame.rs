@@ -3,7 +3,6 @@
 use super::{Machine, terminal};
 use std::path::Path;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
 use voxcast::camera::{Camera, read_calibration_with_notes};
 use voxcast::rig::RigBuilder;
 use voxcast::{Error, ErrorKind, Model, Network, Note, Result, Rig, Scene, Session, SessionOptions};
@@ -97,65 +96,6 @@ fn in_model(error: Error, model: &Model) -> Error {
     match model.path() {
         Some(path) => error.in_file(path),
         None => error,
-    }
-}
-
-/// A session for scenes whose cameras may move from one to the next.
-pub struct Moving {
-    pub session: Session,
-    builder: RigBuilder,
-    calibration: Vec<[f32; 16]>,
-    /// How many rigs it had, and how long building them took.
-    pub rigs: usize,
-    pub rig_time: Duration,
-    /// What is to be said of the first rig.
-    pub notes: Vec<Note>,
-}
-
-impl Moving {
-    /// With the rig of the first scene, from its file or built.
-    pub fn new(model: &Arc<Model>, file: RigFile<'_>, scene: &Scene, options: &SessionOptions) -> Result<Self> {
-        let start = Instant::now();
-        let (rig, notes) = rig(file, model, scene, options)?;
-        let rig_time = start.elapsed();
-        let rig = Arc::new(rig);
-        let builder = RigBuilder::new(model.network(), scene.cameras(), options.isa);
-        Ok(Self {
-            session: session(model, rig, options)?,
-            builder: builder.map_err(|e| in_model(e, model))?.with_threads(options.threads.clone()),
-            calibration: scene.lidar2img.clone(),
-            rigs: 1,
-            rig_time,
-            notes,
-        })
-    }
-
-    /// Whether the scene's cameras stand where those of the rig do.
-    pub fn fits(&self, scene: &Scene) -> bool {
-        self.calibration == scene.lidar2img
-    }
-
-    /// Refuses another number of cameras than the rig's.
-    pub fn check_count(&self, scene: &Scene) -> Result<()> {
-        if self.calibration.len() == scene.cameras() {
-            return Ok(());
-        }
-        let (found, expected) = (scene.cameras(), self.calibration.len());
-        Err(Error::mismatch(format!("{found} cameras, expected {expected} as in the scenes before")))
-    }
-
-    /// Builds the matrices anew if the scene's cameras have moved.
-    pub fn calibrate(&mut self, scene: &Scene) -> Result<()> {
-        self.check_count(scene)?;
-        if !self.fits(scene) {
-            let start = Instant::now();
-            let rig: Rig = self.builder.build(&scene.lidar2img)?;
-            self.session.set_rig(Arc::new(rig))?;
-            self.calibration.clone_from(&scene.lidar2img);
-            self.rigs += 1;
-            self.rig_time += start.elapsed();
-        }
-        Ok(())
     }
 }
 

@@ -1,6 +1,6 @@
 //! `voxcast run` over the scenes of a drive or the frames of a robot log, with one session.
 
-use super::frame::{self, Moving};
+use super::frame;
 use super::frames::{self, Frame, Frames, Results};
 use super::run::{Run, digest, draw, masked, seen, title};
 use super::terminal;
@@ -10,6 +10,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use voxcast::log::Summary;
 use voxcast::picture::Animation;
+use voxcast::session::Moving;
 use voxcast::{Error, Model, Note, Result, Scene, SessionOptions};
 
 /// The scenes in `path`, in the order of their names, if it is a directory of scenes rather than a scene: directories
@@ -107,7 +108,7 @@ impl Run {
                 Some(driver) => driver,
                 none => {
                     let driver = none.insert(Driver::new(self, &model, scene, &options)?);
-                    bar.suspend(|| said.say(std::mem::take(&mut driver.moving.notes)));
+                    bar.suspend(|| said.say(std::mem::take(&mut driver.notes)));
                     driver
                 }
             };
@@ -241,12 +242,19 @@ impl Said {
 /// One session for all scenes.
 struct Driver {
     moving: Moving,
+    /// What is to be said of the first rig.
+    notes: Vec<Note>,
     masked: BTreeSet<usize>,
 }
 
 impl Driver {
     fn new(run: &Run, model: &Arc<Model>, scene: &Scene, options: &SessionOptions) -> Result<Self> {
-        Ok(Self { moving: Moving::new(model, run.rig_file(), scene, options)?, masked: BTreeSet::new() })
+        let start = Instant::now();
+        let (rig, notes) = frame::rig(run.rig_file(), model, scene, options)?;
+        let rig_time = start.elapsed();
+        let mut moving = Moving::new(model, Some(rig), scene, options)?;
+        moving.rig_time = rig_time;
+        Ok(Self { moving, notes, masked: BTreeSet::new() })
     }
 
     /// Makes the session ready for a frame: builds the matrices anew where its cameras have moved, and masks those that

@@ -12,7 +12,7 @@ pub struct Comparison<'a> {
     /// What they were scored on.
     pub data: &'a str,
     /// Names of the classes, the empty one first.
-    pub classes: &'a [&'static str],
+    pub classes: &'a [&'a str],
     /// Frames scored.
     pub frames: usize,
     /// Their sums, of all voxels of the first region ("all").
@@ -26,7 +26,7 @@ impl<'a> Comparison<'a> {
     pub fn of(
         names: [&'a str; 2],
         data: &'a str,
-        classes: &'a [&'static str],
+        classes: &'a [&'a str],
         frames: usize,
         sums: &'a [Confusion],
         totals: &'a FrameScore,
@@ -116,7 +116,8 @@ mod tests {
             confusion
         };
         let sums = [of([(1, 1), (1, 1), (1, 0), (0, 0)]), of([(1, 1), (1, 1), (1, 1), (0, 2)])];
-        let totals = FrameScore { scores: vec![], agreement: Some(of([(1, 1), (1, 1), (0, 1), (0, 2)])) };
+        let totals =
+            FrameScore { digests: vec![], scores: vec![], agreement: Some(of([(1, 1), (1, 1), (0, 1), (0, 2)])) };
         let classes = ["empty", "car", "bus"];
         let comparison = Comparison::of(["a", "b"], "set", &classes, 1, &sums, &totals).expect("two");
         let json = comparison.json();

@@ -4,6 +4,7 @@
 //! frames but the index. Labels are classes of the network's training, [`IGNORED`] where there is no truth.
 
 mod arrays;
+mod named;
 pub mod nuscenes;
 pub mod occ3d_waymo;
 mod published;
@@ -12,6 +13,7 @@ pub mod sscbench;
 mod synthetic;
 
 pub use crate::base::pose::Pose;
+pub use named::{FORMS, Named};
 pub use nuscenes::NuScenes;
 pub use occ3d_waymo::Occ3dWaymo;
 pub use published::Published;

@@ -1,14 +1,16 @@
-//! A file that keeps the score of every frame, so that an evaluation that was stopped goes on where it was.
+//! A file that keeps the score of every frame, so that an evaluation that was stopped goes on where it was, and that many
+//! machines can share one.
 //!
-//! It is JSON by lines. The first line says what is evaluated; a file that says something else is refused. Each further
-//! line is a frame. Lines are appended whole; one that a kill cut short is dropped when the file is opened again.
+//! It is JSON by lines. The first line says what is evaluated, and which shard of it; a file that says something else is
+//! refused. Each further line is a frame. Lines are appended whole; one that a kill cut short is dropped when the file is
+//! opened again.
 
 use super::losses::Losses;
 use super::ray_iou::RayCounts;
+use super::subject::{Shard, Subject};
 use super::{Confusion, FrameScore, Kind, LossSum, Score};
 use crate::base::error::{Error, ErrorKind, Result};
 use serde::{Deserialize, Serialize};
-use serde_json::{Value, json};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
@@ -19,6 +21,10 @@ const MAX_LINE: u64 = 64 << 20;
 /// Voxels or rays that a frame may count.
 const MAX_COUNT: u64 = 1 << 40;
 
+/// What the first line calls the file, and the layout of the lines.
+const FORMAT: &str = "evaluation";
+const VERSION: u32 = 2;
+
 /// An open journal. No other process can open it meanwhile.
 #[derive(Debug)]
 pub struct Journal {
@@ -28,11 +34,28 @@ pub struct Journal {
     length: u64,
 }
 
+/// The first line.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Header {
+    /// Tells journals from other files.
+    voxcast: String,
+    version: u32,
+    /// What is evaluated.
+    pub what: Subject,
+    /// Which of its frames the file is for.
+    pub shard: Shard,
+    /// What the predictors are called, for people. It need not be the same from run to run.
+    pub names: Vec<String>,
+}
+
 /// A frame as it is written. Counts are sparse: places and numbers, one after the other.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Line {
     frame: String,
+    index: usize,
+    digests: Vec<String>,
     scores: Vec<LineScore>,
     agreement: Option<Vec<u64>>,
 }
@@ -48,20 +71,170 @@ struct LineScore {
     losses: [u64; 5],
 }
 
-impl Journal {
-    /// Opens `path`, or begins it. `what` says what is evaluated; `found` is told each frame that is already there, by the
-    /// name it was appended under.
+/// A frame's score with its place in the set.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Entry {
+    /// What the set calls the frame.
+    pub frame: String,
+    /// Its place in the set.
+    pub index: usize,
+    /// What was found.
+    pub score: FrameScore,
+}
+
+impl Entry {
+    /// As a line of a journal, without its end.
     ///
     /// # Errors
-    /// [`ErrorKind::Mismatch`] if the file is of another evaluation; [`ErrorKind::Format`] for a file that is no journal or
-    /// has a malformed line; [`ErrorKind::Io`] if it cannot be read, written and locked, or is open elsewhere.
-    pub fn open(
-        path: &Path,
-        what: &Value,
-        kind: Kind,
-        predictors: usize,
-        found: &mut dyn FnMut(&str, FrameScore),
-    ) -> Result<Self> {
+    /// None that is known.
+    pub fn to_line(&self) -> Result<String> {
+        serde_json::to_string(&Line::of(self)).map_err(|e| Error::format(e.to_string()))
+    }
+
+    /// The entry of a line that [`Entry::to_line`] wrote, in an evaluation of `what`.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Format`] for anything else.
+    pub fn from_line(line: &str, what: &Subject) -> Result<Self> {
+        let line: Line = serde_json::from_str(line).map_err(|e| Error::format(e.to_string()))?;
+        let malformed = || Error::format("counts that no frame of this evaluation has");
+        let score = line.score(what.kind(), what.predictors.len()).ok_or_else(malformed)?;
+        if line.index >= what.frames {
+            return Err(Error::format(format!("frame {}, expected one of {}", line.index, what.frames)));
+        }
+        Ok(Self { frame: line.frame, index: line.index, score })
+    }
+}
+
+impl Header {
+    /// The first line of a journal of `shard` of `what`.
+    pub fn new(what: Subject, shard: Shard, names: Vec<String>) -> Self {
+        Self { voxcast: FORMAT.to_owned(), version: VERSION, what, shard, names }
+    }
+
+    fn parse(line: &[u8]) -> Result<Self> {
+        // The version comes first: another one may have other fields.
+        #[derive(Deserialize)]
+        struct Version {
+            voxcast: String,
+            version: u32,
+        }
+        let Version { voxcast, version } = serde_json::from_slice(line).map_err(|e| Error::format(e.to_string()))?;
+        if (voxcast.as_str(), version) != (FORMAT, VERSION) {
+            let message = format!("{voxcast:?} of version {version}, expected {FORMAT:?} of version {VERSION}");
+            return Err(Error::format(message));
+        }
+        let header: Self = serde_json::from_slice(line).map_err(|e| Error::format(e.to_string()))?;
+        let predictors = [header.what.predictors.len(), header.what.published.len()];
+        if predictors != [header.names.len(); 2] || !matches!(header.names.len(), 1 | 2) {
+            return Err(Error::format(format!("{} names of predictors, expected one or two", header.names.len())));
+        }
+        Ok(header)
+    }
+
+    /// Refuses the header of another evaluation or shard. Names may differ.
+    fn check(&self, expected: &Header) -> Result<()> {
+        if let Some(difference) = self.what.difference(&expected.what) {
+            return Err(Error::mismatch(format!("it is of another evaluation: {difference}")));
+        }
+        if self.shard != expected.shard {
+            return Err(Error::mismatch(format!("it is of shard {}, expected {}", self.shard, expected.shard)));
+        }
+        Ok(())
+    }
+}
+
+/// A journal that is read line by line.
+#[derive(Debug)]
+pub struct JournalReader<'a, R = File> {
+    lines: BufReader<R>,
+    path: &'a Path,
+    header: Option<Header>,
+    /// The line read last, counted from 1.
+    number: u64,
+    /// Bytes of the lines that are whole.
+    whole: u64,
+    /// The line read last. Without an end it was cut short, or is still being written.
+    line: Vec<u8>,
+}
+
+impl<'a> JournalReader<'a> {
+    /// Opens `path` and reads its first line. The file is not changed; another process may be writing it.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Io`] if it cannot be read; [`ErrorKind::Format`] if it is no journal.
+    pub fn open(path: &'a Path) -> Result<(Self, Header)> {
+        let reader = Self::new(File::open(path).map_err(|e| Error::io(path, "open", &e))?, path)?;
+        match reader.header.clone() {
+            Some(header) => Ok((reader, header)),
+            None => Err(reader.not_a_journal()),
+        }
+    }
+}
+
+impl<'a, R: Read> JournalReader<'a, R> {
+    /// Reads the first line, if there is a whole one.
+    fn new(file: R, path: &'a Path) -> Result<Self> {
+        let lines = BufReader::new(file);
+        let mut reader = Self { lines, path, header: None, number: 0, whole: 0, line: Vec::new() };
+        if reader.advance()? {
+            reader.header = Some(Header::parse(&reader.line).map_err(|e| reader.at_line(&e))?);
+        }
+        Ok(reader)
+    }
+
+    /// The next frame; none after the last whole line.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Io`] if the file cannot be read; [`ErrorKind::Format`] for a line that is no frame of the journal's shard.
+    pub fn next_entry(&mut self) -> Result<Option<Entry>> {
+        if self.header.is_none() || !self.advance()? {
+            return Ok(None);
+        }
+        let Some(header) = &self.header else { return Ok(None) };
+        let line = std::str::from_utf8(&self.line).map_err(|e| self.at_line(&Error::format(e.to_string())))?;
+        let entry = Entry::from_line(line, &header.what).map_err(|e| self.at_line(&e))?;
+        if !header.shard.has(entry.index) {
+            let message = format!("frame {} is not of shard {}", entry.index, header.shard);
+            return Err(self.at_line(&Error::format(message)));
+        }
+        Ok(Some(entry))
+    }
+
+    /// The error, said of the line read last.
+    pub fn at_line(&self, error: &Error) -> Error {
+        Error::new(error.kind(), format!("line {}: {}", self.number, error.message())).in_file(self.path)
+    }
+
+    fn not_a_journal(&self) -> Error {
+        Error::format("not a journal of an evaluation").in_file(self.path)
+    }
+
+    /// Reads the next line, without its end. False if there is no whole one.
+    fn advance(&mut self) -> Result<bool> {
+        self.line.clear();
+        let read = (&mut self.lines).take(MAX_LINE).read_until(b'\n', &mut self.line);
+        let length = read.map_err(|e| Error::io(self.path, "read", &e))? as u64;
+        self.number += 1;
+        if self.line.pop_if(|end| *end == b'\n').is_none() {
+            if length == MAX_LINE {
+                return Err(self.at_line(&Error::format(format!("longer than {MAX_LINE} bytes"))));
+            }
+            return Ok(false);
+        }
+        self.whole += length;
+        Ok(true)
+    }
+}
+
+impl Journal {
+    /// Opens `path`, or begins it. `header` says what is evaluated; `found` is told each frame that is already there.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Mismatch`] if the file is of another evaluation or shard; [`ErrorKind::Format`] for a file that is no
+    /// journal or has a malformed line; [`ErrorKind::Io`] if it cannot be read, written and locked, or is open elsewhere;
+    /// what `found` returns.
+    pub fn open(path: &Path, header: &Header, found: &mut dyn FnMut(Entry) -> Result<()>) -> Result<Self> {
         let io = |doing: &'static str| move |e: std::io::Error| Error::io(path, doing, &e);
         let mut file = OpenOptions::new();
         let file = file.read(true).append(true).create(true).open(path).map_err(io("open"))?;
@@ -72,46 +245,27 @@ impl Journal {
             }
             Err(TryLockError::Error(e)) => return Err(Error::io(path, "lock", &e)),
         }
-        let header = json!({ "voxcast": "evaluation", "version": 1, "what": what });
-        let mut reader = BufReader::new(&file);
-        let mut whole = 0;
-        let mut text = Vec::new();
-        for number in 1u64.. {
-            text.clear();
-            let length = (&mut reader).take(MAX_LINE).read_until(b'\n', &mut text).map_err(io("read"))?;
-            let wrong = |message: String| Error::format(format!("line {number}: {message}")).in_file(path);
-            let Some(line) = text.strip_suffix(b"\n") else {
-                if length as u64 == MAX_LINE {
-                    return Err(wrong(format!("longer than {MAX_LINE} bytes")));
-                }
-                break;
-            };
-            if number == 1 {
-                let first: Value = serde_json::from_slice(line).map_err(|e| wrong(e.to_string()))?;
-                if first != header {
-                    let message = format!("it is of another evaluation: {first}, expected {header}");
-                    return Err(Error::mismatch(message).in_file(path));
-                }
-            } else {
-                let line: Line = serde_json::from_slice(line).map_err(|e| wrong(e.to_string()))?;
-                let score = line.score(kind, predictors);
-                found(
-                    &line.frame,
-                    score.ok_or_else(|| wrong("counts that no frame of this evaluation has".to_owned()))?,
-                );
-            }
-            whole += length as u64;
+        let mut reader = JournalReader::new(&file, path)?;
+        if let Some(there) = &reader.header {
+            there.check(header).map_err(|e| e.in_file(path))?;
         }
-        let mut journal = Self { file, path: path.to_owned(), length: whole };
-        if whole == 0 {
-            // Nothing of ours: only an empty file may become a journal.
-            if !text.is_empty() && !format!("{header}\n").as_bytes().starts_with(&text) {
-                return Err(Error::format("not a journal of an evaluation").in_file(path));
+        while let Some(entry) = reader.next_entry()? {
+            found(entry).map_err(|e| reader.at_line(&e))?;
+        }
+        if reader.header.is_none() {
+            // Nothing of ours: only an empty file, or one whose first line was cut short, may become a journal.
+            let start = format!("{{\"voxcast\":\"{FORMAT}\"");
+            let shorter = reader.line.len().min(start.len());
+            if reader.line[..shorter] != start.as_bytes()[..shorter] {
+                return Err(reader.not_a_journal());
             }
-            journal.file.set_len(0).map_err(io("write"))?;
-            journal.write(&header)?;
-        } else {
-            journal.file.set_len(whole).map_err(io("write"))?;
+        }
+        let (whole, empty) = (reader.whole, reader.header.is_none());
+        drop(reader);
+        let mut journal = Self { file, path: path.to_owned(), length: whole };
+        journal.file.set_len(whole).map_err(io("write"))?;
+        if empty {
+            journal.write(serde_json::to_string(header).map_err(|e| Error::format(e.to_string()).in_file(path))?)?;
         }
         Ok(journal)
     }
@@ -120,28 +274,33 @@ impl Journal {
     ///
     /// # Errors
     /// [`ErrorKind::Io`] if it cannot be written; then nothing of it stays in the file.
-    pub fn append(&mut self, frame: &str, score: &FrameScore) -> Result<()> {
-        self.write(&Line::of(frame, score))
+    pub fn append(&mut self, entry: &Entry) -> Result<()> {
+        self.write(entry.to_line().map_err(|e| e.in_file(&self.path))?)
     }
 
-    fn write(&mut self, line: &impl Serialize) -> Result<()> {
-        let mut bytes = serde_json::to_vec(line).map_err(|e| Error::format(e.to_string()).in_file(&self.path))?;
-        bytes.push(b'\n');
-        let written = self.file.write_all(&bytes).and_then(|()| self.file.sync_data());
+    fn write(&mut self, mut line: String) -> Result<()> {
+        line.push('\n');
+        let written = self.file.write_all(line.as_bytes()).and_then(|()| self.file.sync_data());
         if let Err(e) = written {
             // Half a line would make one of it and the next. If this fails too, the next opening refuses the file.
             let _ = self.file.set_len(self.length);
             return Err(Error::io(&self.path, "write", &e));
         }
-        self.length += bytes.len() as u64;
+        self.length += line.len() as u64;
         Ok(())
     }
 }
 
 impl Line {
-    fn of(frame: &str, score: &FrameScore) -> Self {
-        let scores = score.scores.iter().map(LineScore::of).collect();
-        Self { frame: frame.to_owned(), scores, agreement: score.agreement.as_ref().map(sparse) }
+    fn of(entry: &Entry) -> Self {
+        let FrameScore { digests, scores, agreement } = &entry.score;
+        Self {
+            frame: entry.frame.clone(),
+            index: entry.index,
+            digests: digests.iter().map(|digest| format!("{digest:016x}")).collect(),
+            scores: scores.iter().map(LineScore::of).collect(),
+            agreement: agreement.as_ref().map(sparse),
+        }
     }
 
     /// The score, if it is of this kind.
@@ -149,12 +308,14 @@ impl Line {
         if self.scores.len() != predictors || self.agreement.is_some() != (predictors == 2) {
             return None;
         }
+        let hexadecimal = |text: &String| u64::from_str_radix(text, 16).ok().filter(|_| text.len() == 16);
+        let digests = self.digests.iter().map(hexadecimal).collect::<Option<Vec<u64>>>()?;
         let scores = self.scores.iter().map(|score| score.score(kind)).collect::<Option<Vec<Score>>>()?;
         let agreement = match &self.agreement {
             Some(counts) => Some(dense(kind.classes, counts)?),
             None => None,
         };
-        Some(FrameScore { scores, agreement })
+        (digests.len() == predictors).then_some(FrameScore { digests, scores, agreement })
     }
 }
 
@@ -220,6 +381,27 @@ mod tests {
 
     const KIND: Kind = Kind { classes: 3, regions: 2, rings: 2 };
 
+    fn subject(data: &str, predictors: usize) -> Subject {
+        Subject {
+            data: data.to_owned(),
+            frames: 9,
+            ids: "0123456789abcdef".to_owned(),
+            predictors: vec!["model 0".to_owned(); predictors],
+            published: vec![None; predictors],
+            size: [4, 4, 2],
+            bounds: [[-0.1, 0.3]; 3],
+            classes: ["empty", "a", "b"].map(str::to_owned).to_vec(),
+            masks: vec![],
+            losses: true,
+            rings: vec![20.0],
+            version: "1".to_owned(),
+        }
+    }
+
+    fn entry(seed: u8, predictors: usize) -> Entry {
+        Entry { frame: format!("frame \"{seed}\""), index: usize::from(seed), score: frame(seed, predictors) }
+    }
+
     fn frame(seed: u8, predictors: usize) -> FrameScore {
         let mut scores = vec![Score::new(KIND); predictors];
         for score in &mut scores {
@@ -231,13 +413,15 @@ mod tests {
             score.losses.add(&Losses { focal: value, lovasz: value.exp(), geometric: 1e-300, semantic: -0.0 });
         }
         let agreement = (predictors == 2).then(|| Confusion::new(3));
-        FrameScore { scores, agreement }
+        FrameScore { digests: vec![u64::MAX - u64::from(seed); predictors], scores, agreement }
     }
 
-    fn open(path: &Path, what: &str, predictors: usize) -> Result<(Journal, Vec<(String, FrameScore)>)> {
+    fn open(path: &Path, what: &str, predictors: usize, shard: Shard) -> Result<(Journal, Vec<Entry>)> {
         let mut found = Vec::new();
-        let journal = Journal::open(path, &json!(what), KIND, predictors, &mut |name, score| {
-            found.push((name.to_owned(), score));
+        let header = Header::new(subject(what, predictors), shard, vec!["a name".to_owned(); predictors]);
+        let journal = Journal::open(path, &header, &mut |entry| {
+            found.push(entry);
+            Ok(())
         })?;
         Ok((journal, found))
     }
@@ -247,10 +431,11 @@ mod tests {
         for predictors in [1, 2] {
             let dir = tempfile::tempdir().unwrap();
             let path = dir.path().join("journal");
-            let (mut journal, found) = open(&path, "x", predictors).unwrap();
+            let (mut journal, found) = open(&path, "x", predictors, Shard::WHOLE).unwrap();
+            assert_eq!(subject("x", predictors).kind(), KIND);
             assert!(found.is_empty());
-            let frames: Vec<_> = (1..4).map(|seed| (format!("frame \"{seed}\""), frame(seed, predictors))).collect();
-            frames.iter().for_each(|(name, score)| journal.append(name, score).unwrap());
+            let frames: Vec<Entry> = (1..4).map(|seed| entry(seed, predictors)).collect();
+            frames.iter().for_each(|entry| journal.append(entry).unwrap());
             drop(journal);
             let whole = fs::read(&path).unwrap();
             let header = whole.iter().position(|&b| b == b'\n').unwrap() + 1;
@@ -258,13 +443,13 @@ mod tests {
             for length in 0..=whole.len() {
                 fs::write(&path, &whole[..length]).unwrap();
                 let lines = whole[..length].iter().filter(|&&b| b == b'\n').count();
-                let (mut journal, found) = open(&path, "x", predictors).unwrap();
+                let (mut journal, found) = open(&path, "x", predictors, Shard::WHOLE).unwrap();
                 assert_eq!(found, frames[..lines.saturating_sub(1)], "{length} bytes");
-                journal.append("more", &frames[0].1).unwrap();
+                journal.append(&frames[0]).unwrap();
                 drop(journal);
                 let kept = whole[..length].iter().rposition(|&b| b == b'\n').map_or(header, |last| last + 1);
                 assert_eq!(fs::read(&path).unwrap()[..kept], whole[..kept]);
-                assert_eq!(open(&path, "x", predictors).unwrap().1.len(), lines.max(1));
+                assert_eq!(open(&path, "x", predictors, Shard::WHOLE).unwrap().1.len(), lines.max(1));
             }
         }
     }
@@ -273,29 +458,42 @@ mod tests {
     fn what_does_not_belong_is_refused_and_left_alone() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("journal");
-        let refused = |bytes: &[u8], what: &str, predictors: usize, expected: &str| {
+        let shard = |text: &str| text.parse::<Shard>().unwrap();
+        let refused = |bytes: &[u8], what: &str, predictors: usize, part: &str, expected: &str| {
             fs::write(&path, bytes).unwrap();
-            let error = open(&path, what, predictors).unwrap_err();
+            let error = open(&path, what, predictors, shard(part)).unwrap_err();
             assert!(error.message().contains(expected), "{error} does not say {expected:?}");
             assert_eq!(error.path(), Some(path.as_path()));
             assert_eq!(fs::read(&path).unwrap(), bytes);
         };
-        let (mut journal, _) = open(&path, "x", 1).unwrap();
-        journal.append("one", &frame(1, 1)).unwrap();
-        let error = open(&path, "x", 1).unwrap_err();
+        let (mut journal, _) = open(&path, "x", 1, shard("1/2")).unwrap();
+        journal.append(&entry(1, 1)).unwrap();
+        let error = open(&path, "x", 1, shard("1/2")).unwrap_err();
         assert!(error.message().contains("another evaluation has it open"), "{error}");
         drop(journal);
         let good = fs::read(&path).unwrap();
-        refused(&good, "y", 1, "\"what\":\"x\"");
-        refused(&good, "x", 2, "line 2: counts that no frame");
-        refused(b"my notes", "x", 1, "not a journal");
-        refused(b"my notes\n", "x", 1, "line 1");
+        refused(&good, "y", 1, "1/2", "another evaluation: \"data\": found \"x\", expected \"y\"");
+        refused(&good, "x", 2, "1/2", "another evaluation: \"predictors\"");
+        refused(&good, "x", 1, "1/3", "of shard 1/2, expected 1/3");
+        refused(b"my notes", "x", 1, "1/2", "not a journal");
+        refused(b"my notes\n", "x", 1, "1/2", "line 1");
         let text = String::from_utf8(good).unwrap();
-        refused(text.replace("\"regions\":[", "\"regions\":[[],").as_bytes(), "x", 1, "line 2: counts");
-        refused(text.replace("[5,1]", "[9,1]").as_bytes(), "x", 1, "line 2: counts");
-        refused(text.replace("[5,1]", "[5]").as_bytes(), "x", 1, "line 2: counts");
-        refused(text.replace("[5,1]", "[5,1099511627777]").as_bytes(), "x", 1, "line 2: counts");
-        refused(text.replace("[0,9,0]", "[0,0,0]").as_bytes(), "x", 1, "line 2: counts");
-        refused(text.replace("\"losses\"", "\"loses\"").as_bytes(), "x", 1, "line 2: ");
+        for (from, to, expected) in [
+            ("\"regions\":[", "\"regions\":[[],", "line 2: counts that no frame"),
+            ("[5,1]", "[9,1]", "line 2: counts"),
+            ("[5,1]", "[5]", "line 2: counts"),
+            ("[5,1]", "[5,1099511627777]", "line 2: counts"),
+            ("[0,9,0]", "[0,0,0]", "line 2: counts"),
+            ("fffffffe\"]", "fffffffe\",\"0\"]", "line 2: counts"),
+            ("\"losses\":[", "\"loses\":[", "line 2: "),
+            ("\"index\":1", "\"index\":2", "line 2: frame 2 is not of shard 1/2"),
+            ("\"index\":1", "\"index\":9", "line 2: frame 9, expected one of 9"),
+            ("\"version\":2", "\"version\":1", "of version 1, expected"),
+            ("[\"a name\"]", "[]", "line 1: 0 names"),
+            ("\"shard\":[1,2]", "\"shard\":[2,2]", "line 1: shard 2/2"),
+        ] {
+            assert!(text.contains(from), "{from}");
+            refused(text.replacen(from, to, 1).as_bytes(), "x", 1, "1/2", expected);
+        }
     }
 }

@@ -7,24 +7,33 @@
 //! Truth is never changed to suit a network. Where its voxels are not the network's, each labelled voxel is compared with
 //! the predicted voxel that contains its centre; where there is none, the network has said nothing, and it counts as
 //! predicted empty. Networks predict in the lidar frame; labels with other axes are led there by [`Truth::grid_to_lidar`].
+//!
+//! An [`Evaluation`] does all of that over a set, on several threads; a [`Journal`] keeps it from stop to stop, and
+//! [`Summary::merge`] puts the journals of many machines together.
 
 mod comparison;
 mod confusion;
 pub mod dataset;
+mod evaluation;
 mod journal;
 pub mod losses;
 mod majority;
 pub mod ray_iou;
 mod report;
+mod subject;
+mod summary;
 mod table;
 mod totals;
 
 pub use comparison::Comparison;
 pub use confusion::Confusion;
 pub use dataset::Published;
-pub use journal::Journal;
+pub use evaluation::{Evaluation, Means, Predictor, Says, Scope, Worker};
+pub use journal::{Entry, Header, Journal, JournalReader};
 pub use majority::majority;
 pub use report::Report;
+pub use subject::{Shard, Subject};
+pub use summary::Summary;
 pub use totals::{FrameScore, Totals};
 
 use crate::base::error::{Error, Result};

@@ -12,7 +12,7 @@ pub struct Report<'a> {
     /// What was scored on what, for people.
     pub title: &'a str,
     /// Names of the classes, the empty one first.
-    pub classes: &'a [&'static str],
+    pub classes: &'a [&'a str],
     /// Names of the regions ([`Scorer::regions`](super::Scorer::regions)).
     pub regions: &'a [&'a str],
     /// Ends of the rings in metres, as in [`Options::rings`](super::Options::rings).
@@ -23,6 +23,8 @@ pub struct Report<'a> {
     pub frames: usize,
     /// Their sum.
     pub total: &'a Score,
+    /// Of what was predicted in them ([`FrameScore::digests`](super::FrameScore::digests) of a total).
+    pub digest: u64,
 }
 
 impl Report<'_> {
@@ -69,6 +71,7 @@ impl Report<'_> {
         json!({
             "title": self.title,
             "frames": self.frames,
+            "digest": format!("{:016x}", self.digest),
             "classes": self.classes,
             "regions": regions,
             "published": self.published(),

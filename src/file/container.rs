@@ -102,15 +102,49 @@ pub fn write(path: &Path, tensors: Vec<Tensor<'_>>, metadata: &BTreeMap<String, 
     let (header, digits) = header(&tensors, metadata, layout).map_err(|e| e.in_file(path))?;
     let mut file = Replacement::create(path)?;
     let failed = |e: &io::Error| Error::io(path, "write", e);
-    let mut hash = Xxh3::new();
     let mut out = BufWriter::with_capacity(1 << 16, &file.file);
-    let mut put = |bytes: &[u8]| {
-        hash.update(bytes);
-        out.write_all(bytes)
+    let checksum = put(&header, tensors, Some(path), &mut |bytes| out.write_all(bytes).map_err(|e| failed(&e)))?;
+    out.flush().map_err(|e| failed(&e))?;
+    drop(out);
+    file.file.seek(SeekFrom::Start(digits as u64)).map_err(|e| failed(&e))?;
+    file.file.write_all(checksum.as_bytes()).map_err(|e| failed(&e))?;
+    file.commit(path)
+}
+
+/// The bytes of the file that [`write()`] would write.
+///
+/// # Errors
+/// Those of [`write()`] that are not about the file.
+pub fn to_bytes(tensors: Vec<Tensor<'_>>, metadata: &BTreeMap<String, String>, layout: Layout) -> Result<Vec<u8>> {
+    let (header, digits) = header(&tensors, metadata, layout)?;
+    let mut out = Vec::new();
+    let checksum = put(&header, tensors, None, &mut |bytes| {
+        let full = |_| Error::new(ErrorKind::TooLarge, "the system has no memory for the file");
+        out.try_reserve(bytes.len()).map_err(full)?;
+        out.extend_from_slice(bytes);
+        Ok(())
+    })?;
+    out[digits..][..ZEROS.len()].copy_from_slice(checksum.as_bytes());
+    Ok(out)
+}
+
+/// Hands header and data over in order. Returns the digits of the checksum. `path` is what errors of shapes are said of; those of
+/// [`Data::Make`] speak of where the data comes from.
+fn put(
+    header: &[u8],
+    tensors: Vec<Tensor<'_>>,
+    path: Option<&Path>,
+    out: &mut dyn FnMut(&[u8]) -> Result<()>,
+) -> Result<String> {
+    let said = |e: Error| match path {
+        Some(path) => e.in_file(path),
+        None => e,
     };
-    put(&header).map_err(|e| failed(&e))?;
+    let mut hash = Xxh3::new();
+    hash.update(header);
+    out(header)?;
     for tensor in tensors {
-        let expected = tensor.size().map_err(|e| e.in_file(path))?;
+        let expected = tensor.size().map_err(said)?;
         let bytes = match tensor.data {
             Data::Bytes(bytes) => Cow::Borrowed(bytes),
             Data::Make(make) => Cow::Owned(make()?),
@@ -118,15 +152,12 @@ pub fn write(path: &Path, tensors: Vec<Tensor<'_>>, metadata: &BTreeMap<String, 
         if bytes.len() != expected {
             let found = bytes.len();
             let message = format!("tensor {}: {found} bytes given, its shape needs {expected}", tensor.name);
-            return Err(Error::format(message).in_file(path));
+            return Err(said(Error::format(message)));
         }
-        put(&bytes).map_err(|e| failed(&e))?;
+        hash.update(&bytes);
+        out(&bytes)?;
     }
-    out.flush().map_err(|e| failed(&e))?;
-    drop(out);
-    file.file.seek(SeekFrom::Start(digits as u64)).map_err(|e| failed(&e))?;
-    file.file.write_all(format!("{:016x}", hash.digest()).as_bytes()).map_err(|e| failed(&e))?;
-    file.commit(path)
+    Ok(format!("{:016x}", hash.digest()))
 }
 
 /// Length and JSON, padded, with a checksum of zeros; and where in the file its digits lie.
@@ -336,6 +367,11 @@ mod tests {
     fn round_trip_keeps_order_alignment_and_metadata() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("a.safetensors");
+        sample(&path).unwrap();
+        let made = vec![tensor("z", Dtype::U8, &[64], &A)];
+        write(&path, made, &metadata(), Layout::Aligned).unwrap();
+        let same = to_bytes(vec![tensor("z", Dtype::U8, &[64], &A)], &metadata(), Layout::Aligned).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), same);
         sample(&path).unwrap();
         let c = Container::open(&path).unwrap();
         assert_eq!(c.names()[2], "b");

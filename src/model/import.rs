@@ -82,6 +82,20 @@ pub fn import(
     container::write(path, list.tensors(progress), &model::metadata(network, options), model::LAYOUT)
 }
 
+/// Makes a model of the weights that `source` has, in memory: the bytes that [`import`] would write.
+///
+/// # Errors
+/// Those of [`import`] that are not about the file; [`ErrorKind::TooLarge`] if the system has no memory for it.
+pub fn import_to_bytes(
+    source: &dyn Source,
+    network: &Network,
+    options: Options,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Vec<u8>> {
+    let list = Conversion::new(source, network, options)?;
+    container::to_bytes(list.tensors(progress), &model::metadata(network, options), model::LAYOUT)
+}
+
 /// Everything that goes into a model, in file order.
 struct Conversion<'a> {
     source: &'a dyn Source,

@@ -125,11 +125,11 @@ impl Model {
                 expected.0, expected.1
             )));
         }
-        self.bytes(name, part).map(drop)
+        self.part(name, part).map(drop)
     }
 
     /// The bytes of a stored part, without the padding after it.
-    fn bytes(&self, name: &str, part: &Part) -> Result<&[u8]> {
+    fn part(&self, name: &str, part: &Part) -> Result<&[u8]> {
         let size = part.element(self.options.precision).bytes();
         let bytes = self.container.tensor(name).map(|(_, _, bytes)| bytes);
         bytes
@@ -153,9 +153,26 @@ impl Model {
         self.path.as_deref()
     }
 
-    /// Bytes of the file.
+    /// Writes the model to `path`, as it is, by way of a temporary file beside it.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Io`](crate::ErrorKind::Io) if the system refuses.
+    pub fn save(&self, path: &Path) -> Result<()> {
+        let tensors = self.contents().map(|(name, dtype, shape, bytes)| {
+            let shape = shape.to_vec();
+            Tensor { name, dtype, shape, data: Data::Bytes(bytes) }
+        });
+        crate::file::container::write(path, tensors.collect(), self.metadata(), LAYOUT)
+    }
+
+    /// The bytes of the file.
+    pub fn bytes(&self) -> &[u8] {
+        self.container.bytes()
+    }
+
+    /// How many bytes the file has.
     pub fn file_size(&self) -> usize {
-        self.container.bytes().len()
+        self.bytes().len()
     }
 
     /// The file's checksum.
@@ -218,7 +235,7 @@ impl Model {
             .map(|part| {
                 let name = format!("{}.{}", operation.name, part.suffix);
                 self.check(&name, part)?;
-                let bytes = self.bytes(&name, part)?;
+                let bytes = self.part(&name, part)?;
                 let start = bytes.as_ptr() as usize - data.as_ptr() as usize;
                 Ok(PartRef { bytes: start..start + bytes.len(), element: part.element(self.options.precision) })
             })
@@ -274,12 +291,7 @@ pub(crate) fn tensor<'a>(name: String, part: &Part, precision: Precision, data: 
 /// # Errors
 /// [`ErrorKind::Io`] if the system refuses; [`ErrorKind::Format`] for bytes that are no model.
 pub fn write_bytes(path: &Path, bytes: &'static [u8]) -> Result<()> {
-    let model = Model::from_bytes(bytes)?;
-    let tensors = model.contents().map(|(name, dtype, shape, bytes)| {
-        let shape = shape.to_vec();
-        Tensor { name, dtype, shape, data: Data::Bytes(bytes) }
-    });
-    crate::file::container::write(path, tensors.collect(), model.metadata(), LAYOUT)
+    Model::from_bytes(bytes)?.save(path)
 }
 
 /// A model file's metadata.

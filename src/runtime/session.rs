@@ -3,6 +3,7 @@
 mod camera;
 mod frame;
 mod memory;
+mod moving;
 mod output;
 #[cfg(test)]
 mod tests;
@@ -10,7 +11,8 @@ mod tests;
 pub use camera::CameraStatus;
 pub use frame::{Budget, Step};
 pub use memory::Memory;
-pub use output::Occupancy;
+pub use moving::Moving;
+pub use output::{Occupancy, OwnedOccupancy};
 
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::base::threads::Threads;
@@ -102,6 +104,8 @@ pub struct Session {
     front: Output,
     /// The result that is being written.
     back: Output,
+    /// Whether the last complete result has left the session.
+    taken_out: bool,
 }
 
 impl std::fmt::Debug for Session {
@@ -148,6 +152,7 @@ impl Session {
             frame: Frame::default(),
             front,
             back,
+            taken_out: false,
             cameras: zeros(count).ok_or_else(no_memory)?,
             weights,
             model,
@@ -239,6 +244,15 @@ impl Session {
         Ok(())
     }
 
+    /// Copies every camera's next image, and drops what [`Session::step`] had begun: the next steps compute the frame that
+    /// [`Session::run`] would.
+    ///
+    /// # Errors
+    /// As [`Session::run`].
+    pub fn set_cameras(&mut self, images: &[ImageView<'_>]) -> Result<()> {
+        self.receive_all(images.iter().copied())
+    }
+
     /// Does some of what is to be done: passes of the cameras that have a new image, then the fusion of all features. At
     /// least one slice runs, unless there is nothing to do. See [`Budget`] and [`Step`].
     ///
@@ -259,7 +273,27 @@ impl Session {
     /// The last complete result; none before the first frame. It stays as it is while [`Session::step`] works on the next.
     pub fn occupancy(&self) -> Option<Occupancy<'_>> {
         let grid = self.model.network().output_grid();
-        self.frame.any_complete().then(|| self.front.occupancy(grid))
+        (self.frame.any_complete() && !self.taken_out).then(|| self.front.occupancy(grid))
+    }
+
+    /// Takes the last complete result out of the session, without copying it; none before the first frame, or where it was
+    /// taken already. The session goes on with the memory of `spare`, a result of its own that nobody needs any more, and
+    /// without one allocates as much. [`Session::memory`] does not count results that were taken.
+    ///
+    /// # Errors
+    /// [`ErrorKind::TooLarge`] if the system has no memory; the result stays.
+    pub fn take(&mut self, spare: Option<OwnedOccupancy>) -> Result<Option<OwnedOccupancy>> {
+        if !self.frame.any_complete() || self.taken_out {
+            return Ok(None);
+        }
+        let next = match spare.map(OwnedOccupancy::into_output).filter(|spare| spare.fits(&self.front)) {
+            Some(spare) => spare,
+            None => Output::like(&self.front)
+                .ok_or_else(|| Error::new(ErrorKind::TooLarge, "the system has no memory for another result"))?,
+        };
+        let output = std::mem::replace(&mut self.front, next);
+        self.taken_out = true;
+        Ok(Some(OwnedOccupancy::new(self.model.network().output_grid(), output)))
     }
 
     /// The longest time that one slice took so far, and the operation that it was a part of. Slices of [`Session::run`]
@@ -306,6 +340,14 @@ impl Session {
         images: impl ExactSizeIterator<Item = ImageView<'a>> + Clone,
         observer: &mut (dyn FnMut(Event<'_>) + Send),
     ) -> Result<Occupancy<'_>> {
+        self.receive_all(images)?;
+        let step = self.step_observed(Budget::Unlimited, observer);
+        debug_assert_eq!(step, Step::Complete, "every camera has a new image");
+        Ok(self.occupancy().expect("a complete frame"))
+    }
+
+    /// Checks and copies an image for every camera.
+    fn receive_all<'a>(&mut self, images: impl ExactSizeIterator<Item = ImageView<'a>> + Clone) -> Result<()> {
         let count = self.cameras.len();
         if images.len() != count {
             return Err(Error::mismatch(format!("{} images, the rig has {count} cameras", images.len())));
@@ -317,9 +359,7 @@ impl Session {
         for (camera, image) in images.enumerate() {
             self.receive(camera, &image);
         }
-        let step = self.step_observed(Budget::Unlimited, observer);
-        debug_assert_eq!(step, Step::Complete, "every camera has a new image");
-        Ok(self.occupancy().expect("a complete frame"))
+        Ok(())
     }
 
     /// Copies an image, which was checked, to its camera's tensor.

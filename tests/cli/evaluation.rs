@@ -157,11 +157,78 @@ fn an_evaluation_that_was_stopped_goes_on() {
     let line = refused("scores.jsonl", &["eval", "--model", &model, "--data", &data, "--resume", &journal]);
     assert!(line.contains("another evaluation"), "{line}");
     let line = refused("scores.jsonl", &[&resumed[..8], &["--json", &journal]].concat());
-    assert!(line.contains("--resume and --json write the same file"), "{line}");
+    assert!(line.contains("--resume and --json name the same file"), "{line}");
     assert_eq!(fs::read_to_string(&journal).unwrap().lines().count(), 5);
     fs::write(place.path("notes"), "my notes\n").unwrap();
     refused("notes", &["eval", "--model", &model, "--data", &data, "--resume", &place.text("notes")]);
     assert_eq!(fs::read_to_string(place.path("notes")).unwrap(), "my notes\n");
+}
+
+#[test]
+fn shards_of_many_machines_are_put_together() {
+    let place = Place(tempfile::tempdir().unwrap());
+    let [model, data] = street_set(&place);
+    let base = ["eval", "--model", &model, "--data", &data, "--losses"];
+    let [json, markdown] = ["scores.json", "scores.md"].map(|f| place.text(f));
+    let at_once = done(&[&base[..], &["--json", &json, "--markdown", &markdown]].concat());
+    let whole = [&json, &markdown].map(|file| fs::read(file).unwrap());
+    let journals = ["0.jsonl", "1.jsonl", "2.jsonl"].map(|f| place.text(f));
+    let shard = |index: usize, more: &[&str]| {
+        let part = format!("{index}/3");
+        done(&[&base[..], &["--resume", &journals[index], "--shard", &part], more].concat())
+    };
+    assert!(shard(0, &[]).contains("shard 0/3, 2 frames"));
+    shard(2, &[]);
+    // The second one comes by its engine's variables.
+    let slurm = Command::new(env!("CARGO_BIN_EXE_voxcast"))
+        .args(base)
+        .args(["--resume", &journals[1], "--shard", "auto"])
+        .envs([("SLURM_ARRAY_TASK_ID", "2"), ("SLURM_ARRAY_TASK_MIN", "1")])
+        .envs([("SLURM_ARRAY_TASK_MAX", "3"), ("SLURM_ARRAY_TASK_COUNT", "3")])
+        .output()
+        .unwrap();
+    assert!(slurm.status.success(), "{slurm:?}");
+
+    let merge = |order: [usize; 3], more: &[&str]| {
+        let [a, b, c] = order.map(|index| journals[index].as_str());
+        [&["eval", "--merge", a, b, c][..], more].concat().iter().map(|&s| s.to_owned()).collect::<Vec<String>>()
+    };
+    for order in [[0, 1, 2], [2, 0, 1]] {
+        assert_eq!(done(&words(&merge(order, &["--json", &json, "--markdown", &markdown]))), at_once);
+        assert!(
+            [&json, &markdown].map(|file| fs::read(file).unwrap()) == whole,
+            "the numbers of one run, to the last bit"
+        );
+    }
+    // Of the first three frames each shard has one.
+    let three = done(&[&base[..], &["--limit", "3"]].concat());
+    assert_eq!(done(&words(&merge([0, 1, 2], &["--limit", "3"]))), three);
+
+    let [a, b, c] = journals.each_ref().map(String::as_str);
+    let missing = refused("", &["eval", "--merge", a, c]);
+    assert!(missing.contains("shards are missing: 1/3"), "{missing}");
+    fs::copy(b, place.path("copy.jsonl")).unwrap();
+    let overlap = refused("copy.jsonl", &["eval", "--merge", a, b, c, &place.text("copy.jsonl")]);
+    assert!(overlap.contains("shard 1/3, as") && overlap.contains("1.jsonl is: they overlap"), "{overlap}");
+    let text = fs::read_to_string(a).unwrap();
+    let lines: Vec<&str> = text.lines().collect();
+    fs::write(a, lines[..2].join("\n") + "\n").unwrap();
+    let unfinished = refused("0.jsonl", &words(&merge([0, 1, 2], &[])));
+    assert!(unfinished.contains("shard 0/3: 1 of its 2 frames are missing"), "{unfinished}");
+    fs::write(a, text.clone() + lines[1] + "\n").unwrap();
+    assert!(refused("0.jsonl", &words(&merge([0, 1, 2], &[]))).contains("line 4: frame 000000005 is there already"));
+    fs::write(a, &text).unwrap();
+    fs::write(b, fs::read_to_string(b).unwrap().replacen("model ", "model f", 1)).unwrap();
+    let other = refused("1.jsonl", &words(&merge([0, 1, 2], &[])));
+    assert!(other.contains("another evaluation than") && other.contains("\"predictors\": found"), "{other}");
+    // A task that is run again alone is an array of one, which is another shard.
+    let again = [&base[..], &["--resume", a, "--shard", "0/1"]].concat();
+    assert!(refused("0.jsonl", &again).contains("it is of shard 0/3, expected 0/1"));
+    let shared = refused("0.jsonl", &words(&merge([0, 1, 2], &["--json", a])));
+    assert!(shared.contains("--merge and --json name the same file"), "{shared}");
+    for usage in [&["--shard", "3/3", "--resume", a][..], &["--shard", "0/3"]] {
+        assert_eq!(voxcast(&[&base[..], usage].concat()).status.code(), Some(2), "{usage:?}");
+    }
 }
 
 #[test]

@@ -2,9 +2,10 @@
 
 use super::{Axes, Grid, IGNORED, OTHERS, Truth};
 use crate::eval::Confusion;
+use serde::{Deserialize, Serialize};
 
 /// How the published evaluation of a set counts.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Published {
     /// As Occ3D's: over the voxels of the mask of this number, and [`OTHERS`] is a class like the others, which no network
     /// here predicts. Classes that do not occur are left out of the mean.

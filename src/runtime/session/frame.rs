@@ -277,6 +277,7 @@ impl Session {
             camera.passed = false;
         }
         std::mem::swap(&mut self.front, &mut self.back);
+        self.taken_out = false;
         let Frame { changed, completed, slices, .. } = &mut self.frame;
         *changed = false;
         *completed += 1;

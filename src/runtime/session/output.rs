@@ -58,6 +58,33 @@ impl Occupancy<'_> {
     }
 }
 
+/// A result that has left its session ([`Session::take`](super::Session::take)).
+pub struct OwnedOccupancy {
+    grid: [usize; 3],
+    output: Output,
+}
+
+impl std::fmt::Debug for OwnedOccupancy {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("OwnedOccupancy").field("grid", &self.grid).finish_non_exhaustive()
+    }
+}
+
+impl OwnedOccupancy {
+    pub(super) fn new(grid: [usize; 3], output: Output) -> Self {
+        Self { grid, output }
+    }
+
+    /// The result.
+    pub fn view(&self) -> Occupancy<'_> {
+        self.output.occupancy(self.grid)
+    }
+
+    pub(super) fn into_output(self) -> Output {
+        self.output
+    }
+}
+
 /// One result. A session has two: the last complete one, and the one that is being written.
 pub(super) struct Output {
     /// The graph's outputs.
@@ -89,6 +116,24 @@ impl Output {
             cameras: zeros(cameras)?,
             visibility: 0,
         })
+    }
+
+    /// As much memory as `other` has, zeros, unless the system has none.
+    pub(super) fn like(other: &Self) -> Option<Self> {
+        Some(Self {
+            memory: Arena::new(other.memory.len())?,
+            classes: other.classes.clone(),
+            logits: other.logits.clone(),
+            support: zeros(other.support.len())?,
+            cameras: zeros(other.cameras.len())?,
+            visibility: 0,
+        })
+    }
+
+    /// Whether it has as much memory as `other`, laid out the same.
+    pub(super) fn fits(&self, other: &Self) -> bool {
+        let lengths = |o: &Self| [o.memory.len(), o.support.len(), o.cameras.len()];
+        lengths(self) == lengths(other) && self.classes == other.classes && self.logits == other.logits
     }
 
     /// Bytes that [`Output::new`] takes, unless they cannot be counted.

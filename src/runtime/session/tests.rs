@@ -106,3 +106,36 @@ fn events_come_in_running_order() {
     assert_eq!(session.cameras(), 2);
     assert!(format!("{session:?}").starts_with("Session"));
 }
+
+#[test]
+fn results_that_are_taken_out_stay_and_lend_their_memory() {
+    let options = SessionOptions { logits: true, ..SessionOptions::default() };
+    let mut session = Session::new(model(), rig(&tiny(), 2), &options).expect("a session");
+    let pixels = [1, 2].map(|seed| (0..32 * 64 * 3).map(|i| (i * i * seed) as u8).collect::<Vec<u8>>());
+    let frame = |which: usize| [ImageView::bgr(32, 64, &pixels[which]); 2];
+    assert!(session.take(None).expect("nothing to allocate").is_none());
+    // Classes of so small a network are much the same whatever it sees.
+    let digest = |result: &Occupancy<'_>| result.logits_digest().expect("logits");
+    let expected = [0, 1].map(|which| digest(&session.run(&frame(which)).expect("a frame")));
+    assert_ne!(expected[0], expected[1], "images that can be told apart");
+
+    session.set_cameras(&frame(0)).expect("sound images");
+    assert_eq!(session.step(Budget::Unlimited), Step::Complete);
+    let first = session.take(None).expect("memory").expect("a result");
+    assert!(session.occupancy().is_none() && session.take(None).expect("nothing to allocate").is_none());
+    let place = first.view().classes.as_ptr();
+    // A frame that was begun is dropped.
+    session.set_camera(0, frame(0)[0]).expect("sound images");
+    assert_eq!(session.step(Budget::Slices(1)), Step::Running);
+    session.set_cameras(&frame(1)).expect("sound images");
+    assert_eq!(session.step(Budget::Unlimited), Step::Complete);
+    assert_eq!([digest(&first.view()), digest(&session.occupancy().expect("a result"))], expected);
+    assert_eq!(first.view().grid, [16, 8, 8]);
+
+    let second = session.take(Some(first)).expect("memory").expect("a result");
+    assert_eq!(digest(&second.view()), expected[1]);
+    // The memory comes back as the one that is read, after one that is written.
+    let places = [0, 1].map(|which| session.run(&frame(which)).expect("a frame").classes.as_ptr());
+    assert!(places.contains(&place));
+    assert_eq!(digest(&second.view()), expected[1]);
+}

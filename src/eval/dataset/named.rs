@@ -1,13 +1,12 @@
-//! Data sets as they are named on the command line.
+//! Data sets by name, as on the command line.
 
+use super::nuscenes::{Labels, Scenes};
+use super::semantickitti::{Scans, Split};
+use super::{DataSet, NuScenes, Occ3dWaymo, SemanticKitti, SscBench, Synthetic, occ3d_waymo, sscbench};
+use crate::base::error::Result;
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
-use voxcast::Result;
-use voxcast::dataset::nuscenes::{Labels, Scenes};
-use voxcast::dataset::semantickitti::{Scans, Split};
-use voxcast::dataset::{DataSet, NuScenes, Occ3dWaymo, SemanticKitti, SscBench, Synthetic};
-use voxcast::dataset::{occ3d_waymo, sscbench};
 
 /// How sets are named, for help texts.
 pub const FORMS: &str = "\
@@ -31,9 +30,9 @@ const EXPECTED: &str = "expected synthetic:DIR, surroundocc:ROOT:LABELS[:SCENES]
                         openocc:ROOT:LABELS[:SCENES], occ3d-waymo:ROOT:LABELS:SPLIT, sscbench:ROOT[:SPLIT] or \
                         semantickitti:ROOT[:SPLIT[:stereo][:all]]";
 
-/// A data set, not yet opened.
+/// A data set by its name, not yet opened. [`FORMS`] has the names.
 #[derive(Clone, Debug)]
-pub struct Source {
+pub struct Named {
     /// As it was named.
     text: String,
     kind: Kind,
@@ -48,7 +47,7 @@ enum Kind {
     SemanticKitti { root: PathBuf, split: Split, stereo: bool, scans: Scans },
 }
 
-impl FromStr for Source {
+impl FromStr for Named {
     type Err = String;
 
     fn from_str(text: &str) -> std::result::Result<Self, String> {
@@ -95,14 +94,17 @@ fn kitti(root: &str, split: Split, stereo: bool, scans: Scans) -> Kind {
     Kind::SemanticKitti { root: root.into(), split, stereo, scans }
 }
 
-impl fmt::Display for Source {
+impl fmt::Display for Named {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.text)
     }
 }
 
-impl Source {
+impl Named {
     /// Opens the set.
+    ///
+    /// # Errors
+    /// Those of the set, naming the file that is missing or malformed.
     pub fn open(&self) -> Result<Box<dyn DataSet>> {
         Ok(match &self.kind {
             Kind::Synthetic(directory) => Box::new(Synthetic::open(directory)?),
@@ -124,7 +126,7 @@ mod tests {
     use std::path::Path;
 
     fn kind(text: &str) -> Kind {
-        text.parse::<Source>().expect(text).kind
+        text.parse::<Named>().expect(text).kind
     }
 
     #[test]
@@ -148,7 +150,7 @@ mod tests {
         ] {
             let Kind::SemanticKitti { split, stereo, scans, .. } = kind(text) else { panic!("SemanticKITTI") };
             assert_eq!((split, stereo, scans), expected, "{text}");
-            assert_eq!(text.parse::<Source>().expect(text).to_string(), text);
+            assert_eq!(text.parse::<Named>().expect(text).to_string(), text);
         }
     }
 
@@ -175,10 +177,10 @@ mod tests {
             "semantickitti:k:val:all:stereo",
             "occ3d-waymo:k:l",
         ] {
-            assert_eq!(text.parse::<Source>().expect_err(text), EXPECTED);
+            assert_eq!(text.parse::<Named>().expect_err(text), EXPECTED);
         }
-        assert!("sscbench:k:08".parse::<Source>().expect_err("08").contains("train, val or test"));
-        assert!("occ3d-waymo:k:l:val".parse::<Source>().expect_err("val").contains("training or validation"));
-        assert!("semantickitti:k:23".parse::<Source>().expect_err("23").contains("a sequence 00 to 21"));
+        assert!("sscbench:k:08".parse::<Named>().expect_err("08").contains("train, val or test"));
+        assert!("occ3d-waymo:k:l:val".parse::<Named>().expect_err("val").contains("training or validation"));
+        assert!("semantickitti:k:23".parse::<Named>().expect_err("23").contains("a sequence 00 to 21"));
     }
 }
