@@ -227,7 +227,8 @@ voxcast_status voxcast_model_network(
 typedef struct voxcast_options {
     /* sizeof(voxcast_options), set by the caller. */
     size_t size;
-    /* Instruction set: "scalar", "avx2", "avx512"; NULL for the best that this CPU has. */
+    /* Instruction set: "scalar", "avx2", "avx2-vnni", "avx512", "avx512-vnni", "neon", "neon-dot",
+       "neon-i8mm"; NULL for the best that this CPU has. */
     const char *isa;
     /* Threads that compute: 0 or 1 for the calling thread alone, n for it and n - 1 of its own. At most 1024. */
     uint32_t threads;

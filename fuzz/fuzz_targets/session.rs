@@ -18,8 +18,8 @@ use voxcast::rig::RigBuilder;
 use voxcast::seeded::SeededWeights;
 use voxcast::weights::Precision;
 use voxcast::{Budget, ErrorKind, ImageView, Isa, Model, Network, Rig, Session, SessionOptions, Step, Threads};
-use voxcast_fuzz::differential::{Input, same};
 use voxcast_fuzz::{scratch_file, views};
+use voxcast_kernels::cases::{Draw, Output};
 
 /// Multiply-adds, which each weight takes part in, and sample points of a frame, and bytes of a session.
 const MAX_WORK: u64 = 1 << 22;
@@ -29,7 +29,7 @@ const MAX_MEMORY: usize = 1 << 25;
 const MAX_CALLS: usize = 24;
 
 /// Mostly small numbers that fit each other. One in eight networks has one number that any other could be.
-fn network(input: &mut Input<'_>) -> Network {
+fn network(input: &mut Draw) -> Network {
     let basic = input.flag();
     let top = [input.extent(1, 3), input.extent(1, 3), input.extent(1, 2)];
     let key_dims: [usize; 3] = std::array::from_fn(|_| input.extent(1, 3));
@@ -66,7 +66,7 @@ fn network(input: &mut Input<'_>) -> Network {
                 let (level, axis) = (input.extent(0, 3), input.extent(0, 2));
                 match network.grids.get_mut(level) {
                     Some(grid) => grid[axis] = any,
-                    None => network.bounds[axis] = [input.number(), input.number()],
+                    None => network.bounds[axis] = [input.value(), input.value()],
                 }
             }
         }
@@ -91,7 +91,7 @@ impl Source for Weights {
 }
 
 /// The network's model, unless there is something to refuse or too much to compute.
-fn model(input: &mut Input<'_>, network: &Network) -> Option<Arc<Model>> {
+fn model(input: &mut Draw, network: &Network) -> Option<Arc<Model>> {
     let sound = network.check();
     assert_eq!(sound.is_ok(), Network::from_json(&network.to_json()).is_ok_and(|read| read == *network));
     if let Err(refused) = sound {
@@ -135,7 +135,7 @@ fn is_small(graph: &Graph) -> bool {
 }
 
 /// A calibration: a camera that looks around, somewhat wrong or any numbers at all.
-fn calibration(input: &mut Input<'_>, network: &Network) -> [f32; 16] {
+fn calibration(input: &mut Draw, network: &Network) -> [f32; 16] {
     let [height, width] = network.image.map(|v| v as f32);
     let turn = f32::from(input.byte()) / 40.0;
     let (s, c) = turn.sin_cos();
@@ -144,7 +144,7 @@ fn calibration(input: &mut Input<'_>, network: &Network) -> [f32; 16] {
     let rows = [row(right, width * 0.7, width / 2.0), row(down, width * 0.7, height / 2.0), ahead, [0., 0., 0., 1.]];
     let mut matrix: [f32; 16] = rows.concat().try_into().expect("four rows of four");
     if input.byte().is_multiple_of(4) {
-        matrix[input.extent(0, 15)] = input.number();
+        matrix[input.extent(0, 15)] = input.value();
     }
     matrix
 }
@@ -167,7 +167,7 @@ struct Told {
 }
 
 impl Bench {
-    fn new(input: &mut Input<'_>, model: Arc<Model>) -> Option<Self> {
+    fn new(input: &mut Draw, model: Arc<Model>) -> Option<Self> {
         let network = model.network().clone();
         let mut builder = RigBuilder::new(&network, network.cameras, Isa::best()).ok()?;
         let matrices = [0, 1].map(|_| (0..network.cameras).map(|_| calibration(input, &network)).collect::<Vec<_>>());
@@ -209,7 +209,8 @@ impl Bench {
         assert_eq!(found.support, expected.support);
         assert_eq!(found.classes, expected.classes);
         if let Some(logits) = found.logits {
-            same(logits, expected.logits.expect("asked for"), "logits");
+            let difference = Output::from(logits).difference(&Output::from(expected.logits.expect("asked for")));
+            assert_eq!(difference, None, "logits");
         }
     }
 }
@@ -226,7 +227,7 @@ fn threads(count: usize) -> Threads {
     THREADS.get_or_init(|| [1, 2, 3].map(|n| Threads::new(n).expect("a few threads")))[count - 1].clone()
 }
 
-fn options(input: &mut Input<'_>, unfolded: bool) -> SessionOptions {
+fn options(input: &mut Draw, unfolded: bool) -> SessionOptions {
     let sets: Vec<Isa> = Isa::available().collect();
     SessionOptions {
         isa: sets[input.extent(0, sets.len() - 1)],
@@ -238,7 +239,7 @@ fn options(input: &mut Input<'_>, unfolded: bool) -> SessionOptions {
     }
 }
 
-fn budget(input: &mut Input<'_>) -> Budget {
+fn budget(input: &mut Draw) -> Budget {
     match input.extent(0, 3) {
         0 => Budget::Unlimited,
         1 => Budget::Time(Duration::from_micros(u64::from(input.byte()))),
@@ -247,7 +248,7 @@ fn budget(input: &mut Input<'_>) -> Budget {
 }
 
 /// Some calls, each of whose results is compared.
-fn drive(input: &mut Input<'_>, bench: &Bench, session: &mut Session) {
+fn drive(input: &mut Draw, bench: &Bench, session: &mut Session) {
     let cameras = session.cameras();
     let mut told = Told { given: vec![vec![]; cameras], masked: vec![false; cameras], rig: 0 };
     for _ in 0..MAX_CALLS {
@@ -284,7 +285,7 @@ fn drive(input: &mut Input<'_>, bench: &Bench, session: &mut Session) {
 }
 
 fuzz_target!(|bytes: &[u8]| {
-    let mut input = Input::new(bytes);
+    let mut input = Draw::new(bytes);
     let network = network(&mut input);
     let Some(model) = model(&mut input, &network) else { return };
     let Some(bench) = Bench::new(&mut input, model) else { return };

@@ -1,7 +1,5 @@
 //! What the targets share: the smallest network, its model, and containers around fuzzed contents.
 
-pub mod differential;
-
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 use voxcast::import::import;

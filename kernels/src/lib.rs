@@ -12,6 +12,8 @@
 //! Without the default feature `std` the crate needs `core` alone.
 #![cfg_attr(not(any(test, feature = "std")), no_std)]
 
+#[cfg(feature = "cases")]
+pub mod cases;
 pub mod isa;
 pub mod math;
 pub mod matmul;

@@ -65,7 +65,7 @@ pub(crate) trait Simd: Copy {
     /// # Safety
     /// `p` must be valid for writing 16 consecutive f32; no alignment is needed.
     unsafe fn store_ptr(self, p: *mut f32, v: Self::V);
-    /// Widens 16 half-precision numbers, exactly.
+    /// Widens 16 half-precision values, exactly.
     fn widen(self, x: &[f16; LANES]) -> Self::V;
     /// `a + b`.
     fn add(self, a: Self::V, b: Self::V) -> Self::V;
@@ -120,7 +120,7 @@ pub(crate) trait Simd: Copy {
         // SAFETY: the array holds exactly 16 f32.
         unsafe { self.store_ptr(x.as_mut_ptr(), v) }
     }
-    /// Reads the first lanes from up to 16 numbers; the others are 0.
+    /// Reads the first lanes from up to 16 values; the others are 0.
     #[inline(always)]
     fn load_part(self, x: &[f32]) -> Self::V {
         match x.first_chunk() {
@@ -132,7 +132,7 @@ pub(crate) trait Simd: Copy {
             }
         }
     }
-    /// Writes the first lanes into up to 16 numbers.
+    /// Writes the first lanes into up to 16 values.
     #[inline(always)]
     fn store_part(self, x: &mut [f32], v: Self::V) {
         match x.first_chunk_mut() {
@@ -150,7 +150,7 @@ pub(crate) trait Simd: Copy {
     fn relu(self, x: Self::V) -> Self::V {
         self.max(self.splat(0.0), x)
     }
-    /// The lanes as numbers.
+    /// The lanes as values.
     #[inline(always)]
     fn lanes(self, v: Self::V) -> [f32; LANES] {
         let mut lanes = [0.0; LANES];

@@ -1,10 +1,10 @@
-//! What the kernels' tests share: numbers to compute with, and comparisons that name the place of a difference.
+//! What the kernels' tests share: values to compute with, and comparisons that name the place of a difference.
 
 use crate::matmul::layout::{pack, packed_len};
 use crate::matmul::{Panels, Product, Residual};
 use half::f16;
 
-/// A small generator (splitmix64), so that tests see the same numbers everywhere.
+/// A small generator (splitmix64), so that tests see the same values everywhere.
 pub(crate) struct Rng(u64);
 
 impl Rng {
@@ -24,12 +24,12 @@ impl Rng {
         (self.bits() >> 40) as f32 / (1 << 23) as f32 - 1.0
     }
 
-    /// `n` numbers of order one.
+    /// `n` values of order one.
     pub(crate) fn ordinary(&mut self, n: usize) -> Vec<f32> {
         (0..n).map(|_| self.unit()).collect()
     }
 
-    /// `n` finite numbers over 24 binary orders of magnitude, with zeros of both signs and subnormals among them.
+    /// `n` finite values over 24 binary orders of magnitude, with zeros of both signs and subnormals among them.
     pub(crate) fn wide(&mut self, n: usize) -> Vec<f32> {
         let mut one = || {
             let x = self.unit();
@@ -43,7 +43,7 @@ impl Rng {
         (0..n).map(|_| one()).collect()
     }
 
-    /// Like [`Rng::wide`], but about one number in 80 is infinite or NaN, of either sign, quiet or signalling.
+    /// Like [`Rng::wide`], but about one value in 80 is infinite or NaN, of either sign, quiet or signalling.
     pub(crate) fn special(&mut self, n: usize) -> Vec<f32> {
         let mut x = self.wide(n);
         for x in &mut x {
@@ -66,7 +66,7 @@ impl Rng {
     }
 }
 
-/// A source of numbers: [`Rng::ordinary`], [`Rng::wide`] or [`Rng::special`].
+/// A source of values: [`Rng::ordinary`], [`Rng::wide`] or [`Rng::special`].
 pub(crate) type Fill = fn(&mut Rng, usize) -> Vec<f32>;
 
 /// Asserts equal bits, except that any NaN equals any NaN.
@@ -97,12 +97,12 @@ pub(crate) fn assert_order_shows(one: &[f32], other: &[f32], what: &str) {
     assert!(8 * differ >= one.len() && differ > 0, "{what}: only {differ} of {} depend on the order", one.len());
 }
 
-/// The rows of `columns` numbers in opposite order.
+/// The rows of `columns` values in opposite order.
 pub(crate) fn reverse_rows(x: &[f32], columns: usize) -> Vec<f32> {
     x.rchunks_exact(columns).flatten().copied().collect()
 }
 
-/// Each row's numbers in opposite order.
+/// Each row's values in opposite order.
 pub(crate) fn reverse_columns(x: &[f32], columns: usize) -> Vec<f32> {
     x.chunks_exact(columns).flat_map(|row| row.iter().rev()).copied().collect()
 }
@@ -122,7 +122,7 @@ pub(crate) fn assert_close(got: &[f32], want: &[f64], tolerance: f64, what: &str
     }
 }
 
-/// Pads every row of `channels` numbers to a multiple of 16 with `junk`, which a kernel must not let show.
+/// Pads every row of `channels` values to a multiple of 16 with `junk`, which a kernel must not let show.
 pub(crate) fn pad_rows(x: &[f32], channels: usize, junk: f32) -> Vec<f32> {
     let padded = channels.next_multiple_of(crate::LANES);
     let mut out = vec![junk; x.len() / channels * padded];
@@ -149,7 +149,7 @@ impl Tally {
         self.telling.set(self.telling.get() + bits.len());
     }
 
-    /// As [`Tally::count`], if the case has finite numbers only: if [`Rng::fill_of`] its seed is [`Rng::wide`].
+    /// As [`Tally::count`], if the case has finite values only: if [`Rng::fill_of`] its seed is [`Rng::wide`].
     pub(crate) fn count_finite(&self, seed: u64, outputs: &[f32]) {
         if !seed.is_multiple_of(4) {
             self.count(outputs);
@@ -229,7 +229,7 @@ impl Owned {
         }
     }
 
-    /// The same with a residual for `rows` rows, `gap` numbers wider apart than need be, and with a rectifier or not.
+    /// The same with a residual for `rows` rows, `gap` values wider apart than need be, and with ReLU or not.
     pub(crate) fn end(mut self, rng: &mut Rng, fill: Fill, rows: usize, joins: Joins, gap: usize, relu: bool) -> Self {
         self.joins = joins;
         self.relu = relu;
@@ -271,7 +271,7 @@ impl Owned {
     }
 }
 
-/// The nearest half-precision numbers where `half` is asked for.
+/// The nearest half-precision values where `half` is asked for.
 pub(crate) fn round_to(half: bool, mut x: Vec<f32>) -> Vec<f32> {
     if half {
         x.iter_mut().for_each(|x| *x = f16::from_f32(*x).to_f32());
@@ -279,8 +279,8 @@ pub(crate) fn round_to(half: bool, mut x: Vec<f32>) -> Vec<f32> {
     x
 }
 
-/// Runs `write` on `rows` rows of numbers, `stride` apart, which hold `before`. Returns what they hold afterwards, densely;
-/// the numbers in between must be left alone.
+/// Runs `write` on `rows` rows of values, `stride` apart, which hold `before`. Returns what they hold afterwards, densely;
+/// the values in between must be left alone.
 pub(crate) fn write_rows(rows: usize, stride: usize, before: &[f32], write: impl FnOnce(&mut [f32])) -> Vec<f32> {
     let gap = f32::from_bits(0x7fc0_0bad);
     let columns = before.len().checked_div(rows).unwrap_or(0);
@@ -291,7 +291,7 @@ pub(crate) fn write_rows(rows: usize, stride: usize, before: &[f32], write: impl
     let end = out.len().saturating_sub(stride - columns);
     write(&mut out[..end]);
     for (i, v) in out.iter().enumerate() {
-        assert!(i % stride < columns || v.to_bits() == gap.to_bits(), "number {i}, between rows, was written");
+        assert!(i % stride < columns || v.to_bits() == gap.to_bits(), "value {i}, between rows, was written");
     }
     out.chunks(stride.max(1)).flat_map(|row| &row[..columns]).copied().collect()
 }

@@ -114,7 +114,8 @@ impl ThreadCount {
 pub struct Machine {
     #[command(flatten)]
     threads: ThreadCount,
-    /// Instruction set: scalar (the specification, and slow), avx2, avx512 [default: the fastest of this CPU]
+    /// Instruction set: scalar (the specification, and slow), avx2, avx2-vnni, avx512,
+    /// avx512-vnni, neon, neon-dot, neon-i8mm [default: the fastest of this CPU]
     #[arg(long, value_name = "NAME")]
     isa: Option<String>,
 }

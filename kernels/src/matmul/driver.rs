@@ -290,19 +290,100 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
                     s.prefetch(out.as_ptr().wrapping_add(offset + (panel + j) * LANES));
                 }
             }
-            i += s.rows(
-                count - i,
-                Tile {
-                    block,
-                    arithmetic: PhantomData::<A>,
-                    epilogue: &mut *epilogue,
-                    panels: weights,
-                    column: panel * LANES,
-                    first: i,
-                    offsets,
-                    out: &mut *out,
-                },
-            );
+            // A mask that lets everything pass costs nothing, so where there are masks whole columns need no code of their
+            // own.
+            macro_rules! tile {
+                ($whole:literal) => {
+                    Tile::<A, S, B, T, E, P, $whole> {
+                        block,
+                        arithmetic: PhantomData,
+                        epilogue: &mut *epilogue,
+                        panels: weights,
+                        column: panel * LANES,
+                        first: i,
+                        offsets,
+                        out: &mut *out,
+                    }
+                };
+            }
+            i += if S::MASKED || self.columns - panel * LANES < P * LANES {
+                s.rows(count - i, tile!(false))
+            } else {
+                s.rows(count - i, tile!(true))
+            };
+        }
+    }
+}
+
+/// A left matrix that lies in memory: rows `stride` apart, the first one at the start.
+pub(crate) struct Dense<'a, E> {
+    values: &'a [E],
+    stride: usize,
+    depth: usize,
+}
+
+// SAFETY: `row` returns a slice's pointer.
+unsafe impl<E> Left<E> for Dense<'_, E> {
+    #[inline(always)]
+    fn pieces(&self) -> usize {
+        1
+    }
+    #[inline(always)]
+    fn len(&self, _: usize) -> usize {
+        self.depth
+    }
+    #[inline(always)]
+    fn row(&self, _: usize, row: usize) -> *const E {
+        self.values[row * self.stride..][..self.depth].as_ptr()
+    }
+}
+
+impl<'a, E> Dense<'a, E> {
+    /// Rows of `depth` elements.
+    pub(crate) fn new(values: &'a [E], stride: usize, depth: usize) -> Self {
+        Self { values, stride, depth }
+    }
+
+    /// The product with whole panels that a tile can read where they are stored, without blocks: for matrices that fit into
+    /// the first-level cache. A row of `out`, which holds at most [`BLOCK_ROWS`], has `columns` elements, a multiple of 16.
+    #[inline(always)]
+    pub(crate) fn product<A, S, P>(
+        &self,
+        s: S,
+        panels: &[A::Right],
+        epilogue: &mut P,
+        out: &mut [P::Out],
+        columns: usize,
+    ) where
+        S: Simd,
+        A: Arithmetic<S, Left = E>,
+        P: Epilogue<S, A>,
+    {
+        let rows = out.len() / columns;
+        let mut offsets = [0; BLOCK_ROWS];
+        let offsets = &mut offsets[..rows];
+        for (row, offset) in offsets.iter_mut().enumerate() {
+            *offset = row * columns;
+        }
+        let target = Linear { first: 0, stride: columns };
+        let block = Block { left: self, target: &target, row: 0, columns, first: true, last: true };
+        for (i, panel) in panels.chunks_exact((self.depth * LANES).max(1)).enumerate() {
+            let mut first = 0;
+            while first < rows {
+                first += s.rows(
+                    rows - first,
+                    Tile::<A, S, Self, Linear, P, 1, true> {
+                        block: &block,
+                        arithmetic: PhantomData,
+                        epilogue: &mut *epilogue,
+                        panels: [panel],
+                        column: i * LANES,
+                        first,
+                        offsets,
+                        out: &mut *out,
+                    },
+                );
+            }
         }
     }
 }

@@ -3,35 +3,88 @@
 use super::driver::Target;
 use super::tile::{Arithmetic, Single};
 use crate::simd::{LANES, Simd, relu};
+use core::ops::Range;
 
-/// Up to 16 outputs of one row, side by side.
-pub(crate) struct Place<'a, T> {
-    /// The first one's column.
+/// Where the outputs of a tile of `N` rows are.
+pub(crate) struct Place<'a, T, const N: usize> {
+    /// The first column.
     pub(crate) column: usize,
-    /// The row in the whole product.
+    /// Columns of the whole product. If `WHOLE`, as the methods below call it, the tile's all exist; else the last vector of
+    /// them may lack some.
+    pub(crate) columns: usize,
+    /// The first row in the whole product.
     pub(crate) row: usize,
     pub(crate) target: &'a T,
+    /// Where each row of the product starts in the output.
+    pub(crate) offsets: &'a [usize; N],
 }
 
-/// What a product does besides multiplying and adding. `out` is the place's outputs: exactly 16 if `WHOLE`.
+impl<T: Target, const N: usize> Place<'_, T, N> {
+    /// First column of vector `j`.
+    #[inline(always)]
+    pub(crate) fn column(&self, j: usize) -> usize {
+        self.column + j * LANES
+    }
+
+    /// Columns of vector `j`.
+    #[inline(always)]
+    pub(crate) fn len<const WHOLE: bool>(&self, j: usize) -> usize {
+        if WHOLE { LANES } else { LANES.min(self.columns - self.column(j)) }
+    }
+
+    /// Vector `j` of row `r` in the output.
+    #[inline(always)]
+    pub(crate) fn range<const WHOLE: bool>(&self, r: usize, j: usize) -> Range<usize> {
+        let start = self.offsets[r] + self.column(j);
+        start..start + self.len::<WHOLE>(j)
+    }
+
+    /// Vector `j` of row `r` in a residual whose rows are `stride` apart.
+    #[inline(always)]
+    fn residual<const WHOLE: bool>(&self, r: usize, j: usize, stride: usize) -> Range<usize> {
+        let start = self.target.residual_row(self.row + r) * stride + self.column(j);
+        start..start + self.len::<WHOLE>(j)
+    }
+}
+
+/// What a product does besides multiplying and adding, a tile of `N` rows by `P` vectors at a time.
 ///
 /// A chain that is too long for one block of k is paused between two of them.
 pub(crate) trait Epilogue<S: Simd, A: Arithmetic<S>> {
     /// Element of the output.
     type Out;
 
-    /// The sums before the first product. `out` is as it was before the call.
-    fn start<T: Target, const WHOLE: bool>(&self, s: S, place: &Place<'_, T>, out: &[Self::Out]) -> A::Sums;
+    /// The sums before the first product. The tile's place in `out` is as it was before the call.
+    fn start<T: Target, const N: usize, const P: usize, const WHOLE: bool>(
+        &self,
+        s: S,
+        place: &Place<'_, T, N>,
+        out: &[Self::Out],
+    ) -> [[A::Sums; P]; N];
+
     /// The sums that [`Epilogue::pause`] was given.
-    fn resume<T: Target, const WHOLE: bool>(&self, s: S, place: &Place<'_, T>, out: &[Self::Out]) -> A::Sums;
+    fn resume<T: Target, const N: usize, const P: usize, const WHOLE: bool>(
+        &self,
+        s: S,
+        place: &Place<'_, T, N>,
+        out: &[Self::Out],
+    ) -> [[A::Sums; P]; N];
+
     /// Keeps sums that are not complete.
-    fn pause<T: Target, const WHOLE: bool>(&mut self, s: S, place: &Place<'_, T>, sums: A::Sums, out: &mut [Self::Out]);
-    /// Writes the outputs of complete sums.
-    fn finish<T: Target, const WHOLE: bool>(
+    fn pause<T: Target, const N: usize, const P: usize, const WHOLE: bool>(
         &mut self,
         s: S,
-        place: &Place<'_, T>,
-        sums: A::Sums,
+        place: &Place<'_, T, N>,
+        sums: [[A::Sums; P]; N],
+        out: &mut [Self::Out],
+    );
+
+    /// Writes the outputs of complete sums.
+    fn finish<T: Target, const N: usize, const P: usize, const WHOLE: bool>(
+        &mut self,
+        s: S,
+        place: &Place<'_, T, N>,
+        sums: [[A::Sums; P]; N],
         out: &mut [Self::Out],
     );
 }
@@ -50,7 +103,7 @@ pub enum Residual<'a> {
         /// Distance between its rows.
         stride: usize,
     },
-    /// Added after the rectifier.
+    /// Added after ReLU.
     After {
         /// The tensor, from its first row on.
         rows: &'a [f32],
@@ -95,46 +148,94 @@ impl<S: Simd> Epilogue<S, Single> for End<'_> {
     type Out = f32;
 
     #[inline(always)]
-    fn start<T: Target, const WHOLE: bool>(&self, s: S, place: &Place<'_, T>, out: &[f32]) -> S::V {
-        let start = match self.bias {
-            Some(bias) => s.load_part(&bias[place.column..place.column + LANES]),
-            None => s.splat(0.0),
-        };
-        match self.residual {
-            Residual::InPlace => s.add(start, load::<S, WHOLE>(s, out)),
-            Residual::Before { rows, stride } => {
-                s.add(start, load::<S, WHOLE>(s, added(rows, stride, place, out.len())))
+    fn start<T: Target, const N: usize, const P: usize, const WHOLE: bool>(
+        &self,
+        s: S,
+        place: &Place<'_, T, N>,
+        out: &[f32],
+    ) -> [[S::V; P]; N] {
+        let mut start = [s.splat(0.0); P];
+        if let Some(bias) = self.bias {
+            for j in 0..P {
+                start[j] = s.load_part(&bias[place.column(j)..place.column(j) + LANES]);
             }
-            _ => start,
+        }
+        let mut sums = [start; N];
+        match self.residual {
+            Residual::InPlace => add::<S, N, P, WHOLE>(s, &mut sums, |r, j| &out[place.range::<WHOLE>(r, j)]),
+            Residual::Before { rows, stride } => {
+                add::<S, N, P, WHOLE>(s, &mut sums, |r, j| &rows[place.residual::<WHOLE>(r, j, stride)]);
+            }
+            _ => {}
+        }
+        sums
+    }
+
+    #[inline(always)]
+    fn resume<T: Target, const N: usize, const P: usize, const WHOLE: bool>(
+        &self,
+        s: S,
+        place: &Place<'_, T, N>,
+        out: &[f32],
+    ) -> [[S::V; P]; N] {
+        let mut sums = [[s.splat(0.0); P]; N];
+        for r in 0..N {
+            for j in 0..P {
+                sums[r][j] = load::<S, WHOLE>(s, &out[place.range::<WHOLE>(r, j)]);
+            }
+        }
+        sums
+    }
+
+    #[inline(always)]
+    fn pause<T: Target, const N: usize, const P: usize, const WHOLE: bool>(
+        &mut self,
+        s: S,
+        place: &Place<'_, T, N>,
+        sums: [[S::V; P]; N],
+        out: &mut [f32],
+    ) {
+        for r in 0..N {
+            for j in 0..P {
+                store::<S, WHOLE>(s, &mut out[place.range::<WHOLE>(r, j)], sums[r][j]);
+            }
         }
     }
 
     #[inline(always)]
-    fn resume<T: Target, const WHOLE: bool>(&self, s: S, _: &Place<'_, T>, out: &[f32]) -> S::V {
-        load::<S, WHOLE>(s, out)
-    }
-
-    #[inline(always)]
-    fn pause<T: Target, const WHOLE: bool>(&mut self, s: S, _: &Place<'_, T>, sums: S::V, out: &mut [f32]) {
-        store::<S, WHOLE>(s, out, sums);
-    }
-
-    #[inline(always)]
-    fn finish<T: Target, const WHOLE: bool>(&mut self, s: S, place: &Place<'_, T>, mut sums: S::V, out: &mut [f32]) {
+    fn finish<T: Target, const N: usize, const P: usize, const WHOLE: bool>(
+        &mut self,
+        s: S,
+        place: &Place<'_, T, N>,
+        mut sums: [[S::V; P]; N],
+        out: &mut [f32],
+    ) {
         if self.relu {
-            sums = s.relu(sums);
+            for r in 0..N {
+                for j in 0..P {
+                    sums[r][j] = s.relu(sums[r][j]);
+                }
+            }
         }
         if let Residual::After { rows, stride } = self.residual {
-            sums = s.add(sums, load::<S, WHOLE>(s, added(rows, stride, place, out.len())));
+            add::<S, N, P, WHOLE>(s, &mut sums, |r, j| &rows[place.residual::<WHOLE>(r, j, stride)]);
         }
-        store::<S, WHOLE>(s, out, sums);
+        self.pause::<T, N, P, WHOLE>(s, place, sums, out);
     }
 }
 
-/// The residual's values for `len` outputs.
+/// `sums[r][j] += x(r, j)`
 #[inline(always)]
-fn added<'a, T: Target>(rows: &'a [f32], stride: usize, place: &Place<'_, T>, len: usize) -> &'a [f32] {
-    &rows[place.target.residual_row(place.row) * stride + place.column..][..len]
+fn add<'a, S: Simd, const N: usize, const P: usize, const WHOLE: bool>(
+    s: S,
+    sums: &mut [[S::V; P]; N],
+    x: impl Fn(usize, usize) -> &'a [f32],
+) {
+    for r in 0..N {
+        for j in 0..P {
+            sums[r][j] = s.add(sums[r][j], load::<S, WHOLE>(s, x(r, j)));
+        }
+    }
 }
 
 /// Up to 16 values; exactly 16 if `WHOLE`.

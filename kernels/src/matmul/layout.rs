@@ -33,7 +33,7 @@ impl Panels<'_> {
         self.len() == 0
     }
 
-    /// The 16 numbers from packed position `i` on, widened. For the specification; bodies read whole panels.
+    /// The 16 values from packed position `i` on, widened. For the specification; bodies read whole panels.
     #[inline(always)]
     pub(crate) fn lanes(&self, i: usize) -> [f32; LANES] {
         match self {
@@ -161,7 +161,7 @@ mod tests {
                 let mut wide = [0.0; LANES];
                 dispatch(isa, Widen(&narrow, &mut wide));
                 for (bits, got) in (first..=u16::MAX).zip(wide) {
-                    // The number from its fields: sign, 5 bits of exponent, 10 of fraction.
+                    // The value from its fields: sign, 5 bits of exponent, 10 of fraction.
                     let (exponent, fraction) = (i32::from(bits >> 10 & 31), f64::from(bits & 1023) / 1024.0);
                     let value = match exponent {
                         0 => fraction * 2f64.powi(-14),

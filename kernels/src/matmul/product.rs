@@ -18,7 +18,7 @@ pub const SCRATCH: usize = BLOCK_LEN + PANEL_LEN;
 pub struct Product<'a> {
     /// Packed weights of `depth` x `columns`.
     pub weights: Panels<'a>,
-    /// One number per column, padded with anything to a multiple of 16.
+    /// One value per column, padded with anything to a multiple of 16.
     pub bias: &'a [f32],
     /// Length of every chain.
     pub depth: usize,

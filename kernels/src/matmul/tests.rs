@@ -47,7 +47,7 @@ impl Source for Case {
     }
 }
 
-/// Which of the sixteen ways through the code: left matrix stored, half precision, residual, rectifier.
+/// Which of the sixteen ways through the code: left matrix stored, half precision, residual, ReLU.
 #[derive(Clone, Copy, Debug)]
 struct Way {
     stored: bool,
@@ -189,7 +189,7 @@ fn the_order_of_a_chain_shows() {
 }
 
 #[test]
-fn the_rectifier_keeps_nan_and_the_sign_of_zero() {
+fn relu_keeps_nan_and_the_sign_of_zero() {
     for isa in Isa::available() {
         let mut case = Case::new([1, 4, 1], Way { relu: true, ..PLAIN }, 0, Rng::ordinary);
         case.left = vec![0.0];

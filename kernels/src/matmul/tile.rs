@@ -95,8 +95,8 @@ pub(crate) struct Block<'a, L, T> {
     pub(crate) last: bool,
 }
 
-/// Some rows of `P` panels.
-pub(crate) struct Tile<'a, A, S, L, T, E, const P: usize>
+/// Some rows of `P` panels. `WHOLE` says that all columns exist; else only the last panel lacks some.
+pub(crate) struct Tile<'a, A, S, L, T, E, const P: usize, const WHOLE: bool>
 where
     S: Simd,
     A: Arithmetic<S>,
@@ -116,7 +116,7 @@ where
     pub(crate) out: &'a mut [E::Out],
 }
 
-impl<A, S, L, T, E, const P: usize> TileRows<S> for Tile<'_, A, S, L, T, E, P>
+impl<A, S, L, T, E, const P: usize, const WHOLE: bool> TileRows<S> for Tile<'_, A, S, L, T, E, P, WHOLE>
 where
     S: Simd,
     A: Arithmetic<S>,
@@ -126,45 +126,14 @@ where
 {
     #[inline(always)]
     fn run<const N: usize>(self, s: S) {
-        // A mask that lets everything pass costs nothing, so where there are masks whole columns need no code of their own.
-        if S::MASKED || self.block.columns - self.column < P * LANES {
-            self.rows::<N, false>(s);
-        } else {
-            self.rows::<N, true>(s);
-        }
-    }
-}
-
-impl<A, S, L, T, E, const P: usize> Tile<'_, A, S, L, T, E, P>
-where
-    S: Simd,
-    A: Arithmetic<S>,
-    L: Left<A::Left>,
-    T: Target,
-    E: Epilogue<S, A>,
-{
-    /// `WHOLE` says that all columns exist; else only the last panel lacks some.
-    #[inline(always)]
-    fn rows<const N: usize, const WHOLE: bool>(self, s: S) {
         let Self { block, epilogue, panels, column, first, offsets, out, .. } = self;
         let offsets: &[usize; N] = offsets[first..].first_chunk().expect("the block has these rows");
-        let place =
-            |r: usize, j: usize| Place { column: column + j * LANES, row: block.row + first + r, target: block.target };
-        let range = |r: usize, j: usize| {
-            let column = column + j * LANES;
-            let start = offsets[r] + column;
-            start..start + if WHOLE { LANES } else { LANES.min(block.columns - column) }
+        let place = Place { column, columns: block.columns, row: block.row + first, target: block.target, offsets };
+        let mut sums = if block.first {
+            epilogue.start::<T, N, P, WHOLE>(s, &place, out)
+        } else {
+            epilogue.resume::<T, N, P, WHOLE>(s, &place, out)
         };
-        let mut sums: [[A::Sums; P]; N] = core::array::from_fn(|r| {
-            core::array::from_fn(|j| {
-                let (place, out) = (place(r, j), &out[range(r, j)]);
-                if block.first {
-                    epilogue.start::<T, WHOLE>(s, &place, out)
-                } else {
-                    epilogue.resume::<T, WHOLE>(s, &place, out)
-                }
-            })
-        });
         let mut k = 0;
         for piece in 0..block.left.pieces() {
             let len = block.left.len(piece);
@@ -174,15 +143,10 @@ where
             sums = unsafe { A::multiply(s, left, panels, len, sums) };
             k += len;
         }
-        for r in 0..N {
-            for j in 0..P {
-                let (place, out) = (place(r, j), &mut out[range(r, j)]);
-                if block.last {
-                    epilogue.finish::<T, WHOLE>(s, &place, sums[r][j], out);
-                } else {
-                    epilogue.pause::<T, WHOLE>(s, &place, sums[r][j], out);
-                }
-            }
+        if block.last {
+            epilogue.finish::<T, N, P, WHOLE>(s, &place, sums, out);
+        } else {
+            epilogue.pause::<T, N, P, WHOLE>(s, &place, sums, out);
         }
     }
 }

@@ -88,7 +88,7 @@ pub struct Conv<'a> {
 }
 
 /// Convolves the output rows `rows` (positions in depth, height, width order) into `out`, which holds exactly those rows,
-/// `stride` numbers apart. `scratch` holds [`crate::matmul::SCRATCH`] numbers of any value.
+/// `stride` values apart. `scratch` holds [`crate::matmul::SCRATCH`] values of any value.
 ///
 /// # Panics
 /// If a slice does not have the size that the shapes ask for.
@@ -245,5 +245,7 @@ fn copy<S: Simd>(s: S, from: &[f32], to: &mut [f32]) {
     }
 }
 
+#[cfg(feature = "cases")]
+pub(crate) mod cases;
 #[cfg(test)]
 mod tests;

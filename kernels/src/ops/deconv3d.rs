@@ -36,16 +36,16 @@ pub struct Deconv3d<'a> {
     pub input: &'a [f32],
     /// The eight packed matrices.
     pub weights: Panels<'a>,
-    /// One number per output channel, padded to a multiple of 16.
+    /// One value per output channel, padded to a multiple of 16.
     pub bias: &'a [f32],
     /// Whether negative results become 0.
     pub relu: bool,
-    /// `[2 * extent, columns]`, added after the rectifier.
+    /// `[2 * extent, columns]`, added after ReLU.
     pub add: Option<&'a [f32]>,
 }
 
 /// Computes the planes `planes` of the output's first axis into `out`, which holds exactly those, densely. `scratch`
-/// holds [`crate::matmul::SCRATCH`] numbers of any value.
+/// holds [`crate::matmul::SCRATCH`] values of any value.
 ///
 /// # Panics
 /// If a slice does not have the size that the shapes ask for.
@@ -187,6 +187,8 @@ impl Kernel for Run<'_> {
     }
 }
 
+#[cfg(feature = "cases")]
+pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -214,7 +216,7 @@ mod tests {
         natural: Vec<f32>,
     }
 
-    /// Half precision, added tensor, rectifier.
+    /// Half precision, added tensor, ReLU.
     type Way = [bool; 3];
 
     impl Case {

@@ -37,8 +37,8 @@ pub struct DeformConv2d<'a> {
     pub product: Product<'a>,
 }
 
-/// Convolves the output rows `rows` into `out`, which holds exactly those rows, `stride` numbers apart. `scratch` holds
-/// [`crate::matmul::SCRATCH`] numbers of any value.
+/// Convolves the output rows `rows` into `out`, which holds exactly those rows, `stride` values apart. `scratch` holds
+/// [`crate::matmul::SCRATCH`] values of any value.
 ///
 /// Offsets may be anything; a sample whose position is NaN is 0.
 ///
@@ -188,5 +188,7 @@ fn mix<S: Simd>(s: S, [a, b, c, d]: [S::V; 4], weights: [S::V; 4]) -> S::V {
     s.mul_add(weights[3], d, s.mul_add(weights[2], c, value))
 }
 
+#[cfg(feature = "cases")]
+pub(crate) mod cases;
 #[cfg(test)]
 mod tests;

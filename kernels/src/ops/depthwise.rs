@@ -32,7 +32,7 @@ pub struct Depthwise<'a> {
     pub kernel: usize,
     /// `[kernel, kernel, channels]`, each tap's channels padded with anything to a multiple of 16.
     pub weights: &'a [f32],
-    /// One number per channel, padded likewise.
+    /// One value per channel, padded likewise.
     pub bias: &'a [f32],
     /// Whether the input itself is added.
     pub residual: bool,
@@ -177,6 +177,8 @@ impl Depthwise<'_> {
     }
 }
 
+#[cfg(feature = "cases")]
+pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;

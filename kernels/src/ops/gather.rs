@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! sum[c]    = x[col[ptr[r]]][c] + x[col[ptr[r] + 1]][c] + ...          ascending, starting from 0
-//! out[r][c] = end(sum[c] / max(1, entries of r))                        end: + bias[c], rectifier; both optional
+//! out[r][c] = end(sum[c] / max(1, entries of r))                        end: + bias[c], ReLU; both optional
 //! ```
 //!
 //! A [`Mask`] leaves out the pixels of some cameras: sum and count are then those of a matrix without their entries.
@@ -84,7 +84,7 @@ pub struct Gather<'a> {
     pub col: &'a [u32],
     /// Cameras to leave out.
     pub mask: Option<Mask<'a>>,
-    /// Feature pixels, `stride` numbers apart.
+    /// Feature pixels, `stride` values apart.
     pub features: &'a [f32],
     /// Distance between feature pixels.
     pub stride: usize,
@@ -92,7 +92,7 @@ pub struct Gather<'a> {
     pub first_channel: usize,
     /// Channels that are gathered.
     pub channels: usize,
-    /// Added to the mean, one number per channel.
+    /// Added to the mean, one value per channel.
     pub bias: Option<&'a [f32]>,
     /// Whether negative results become 0.
     pub relu: bool,
@@ -196,7 +196,7 @@ impl Kernel for Run<'_> {
     }
 }
 
-/// Divides, adds the bias, rectifies and stores up to 16 channels.
+/// Divides, adds the bias, applies ReLU and stores up to 16 channels.
 #[inline(always)]
 fn finish<S: Simd>(s: S, a: &Gather<'_>, channel: usize, count: S::V, sum: S::V, out: &mut [f32]) {
     let mut value = s.div(sum, count);
@@ -209,6 +209,8 @@ fn finish<S: Simd>(s: S, a: &Gather<'_>, channel: usize, count: S::V, sum: S::V,
     s.store_part(out, value);
 }
 
+#[cfg(feature = "cases")]
+pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -480,7 +482,7 @@ mod tests {
         for (lengths, channels) in table() {
             for end in [[false, false], [true, true]] {
                 let case = Case::new(&lengths, 40, channels, end, 6, Rng::ordinary);
-                // 128 numbers below 1, then a division by 128: a few roundings of numbers below 1 remain.
+                // 128 values below 1, then a division by 128: a few roundings of values below 1 remain.
                 assert_close(&case.all(Isa::Scalar), &case.naive(), 1e-6, &format!("{lengths:?} {channels}"));
             }
         }

@@ -1,11 +1,11 @@
-//! The occupancy head: three linear layers per voxel, a rectifier after the first two, and the largest class.
+//! The occupancy head: three linear layers per voxel, ReLU after the first two, and the largest class.
 //!
 //! ```text
 //! a = relu(W1 x + b1),  b = relu(W2 a + b2),  logits = W3 b + b3,  class = first k with the largest logits[k]
 //! ```
 //!
 //! Each layer is a [`crate::product`]. A block of voxels goes through all three while it is in the cache, so the logits
-//! of the whole grid need not exist. A later class wins only if its logit is greater, so NaN never wins over a number
+//! of the whole grid need not exist. A later class wins only if its logit is greater, so NaN never wins over a value
 //! that comes first.
 
 use crate::isa::Isa;
@@ -37,7 +37,7 @@ pub const fn scratch_len(channels: usize, classes: usize) -> usize {
 /// Classifies the voxels `rows` into `classes_out`, one byte each; `logits_out`, if given, takes their logits.
 ///
 /// # Panics
-/// If a slice does not have the size that the shapes ask for; `scratch` needs [`scratch_len`] numbers of any value.
+/// If a slice does not have the size that the shapes ask for; `scratch` needs [`scratch_len`] values of any value.
 ///
 /// # Determinism
 /// The same bits on every instruction set and for every division into rows.
@@ -214,6 +214,8 @@ fn between<'a>(
     }
 }
 
+#[cfg(feature = "cases")]
+pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -396,7 +398,7 @@ mod tests {
             for half in [false, true] {
                 let logits = Case::new(shape, half, 3, Rng::wide).assert_every_isa(&format!("{shape:?} {half}"));
                 if shape[1] > 1 {
-                    // One channel may be rectified away.
+                    // One channel may be cut off by ReLU.
                     tally.count(&logits);
                 }
             }

@@ -27,6 +27,8 @@ pub fn normalise(image: &[u8], height: usize, width: usize, padded_width: usize,
     }
 }
 
+#[cfg(feature = "cases")]
+pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -34,7 +34,7 @@ impl Mean<'_> {
     }
 }
 
-/// The mean over all rows into `out`, one number per channel.
+/// The mean over all rows into `out`, one value per channel.
 ///
 /// # Panics
 /// If there are no rows or more than 2^24, or a slice does not have the size that the shapes ask for.
@@ -91,6 +91,8 @@ pub fn broadcast(row: &[f32], stride: usize, offset: usize, out: &mut [f32]) {
     }
 }
 
+#[cfg(feature = "cases")]
+pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;

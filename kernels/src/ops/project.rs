@@ -110,12 +110,17 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
-    /// Every line of constant x and y, with its place in the output.
+    /// Calls `line` with every x and y and the output of the points between them.
     #[inline(always)]
-    fn lines(&mut self) -> impl Iterator<Item = (f32, f32, &mut [u32])> {
-        let points = self.xs.iter().flat_map(|&x| self.ys.iter().map(move |&y| (x, y)));
-        // No points on a line: there is no output either.
-        points.zip(self.out.chunks_exact_mut(self.zs.len().max(1))).map(|((x, y), line)| (x, y, line))
+    fn lines(&mut self, mut line: impl FnMut(f32, f32, &mut [u32])) {
+        let mut rest = &mut *self.out;
+        for &x in self.xs {
+            for &y in self.ys {
+                let out;
+                (out, rest) = rest.split_at_mut(self.zs.len());
+                line(x, y, out);
+            }
+        }
     }
 
     /// Whether any point hit a pixel.
@@ -131,11 +136,14 @@ impl Kernel for Run<'_> {
     #[inline(always)]
     fn reference(mut self) -> bool {
         let (p, zs) = (self.p, self.zs);
-        for (x, y, line) in self.lines() {
-            for (&z, out) in zs.iter().zip(line) {
-                *out = p.pixel(x, y, z);
-            }
-        }
+        self.lines(
+            #[inline(always)]
+            |x, y, line| {
+                for (&z, out) in zs.iter().zip(line) {
+                    *out = p.pixel(x, y, z);
+                }
+            },
+        );
         self.hits()
     }
 
@@ -155,27 +163,22 @@ impl Run<'_> {
         let (p, zs) = (self.p, self.zs);
         let pixels = Pixels::new(s, p);
         let slope = [2, 6, 10].map(|at| s.splat(p.matrix[at]));
-        for (x, y, line) in self.lines() {
-            // PAIRS: (first + slope * z) + second; else fma(slope, z, first) + second.
-            let [first, second] = line_terms::<S, PAIRS>(s, p, x, y);
-            for (z, out) in zs.chunks(LANES).zip(line.chunks_mut(LANES)) {
-                let z = s.load_part(z);
-                let dots: [S::V; 3] = core::array::from_fn(|r| {
-                    let head =
-                        if PAIRS { s.add(first[r], s.mul(slope[r], z)) } else { s.mul_add(slope[r], z, first[r]) };
-                    s.add(head, second[r])
-                });
-                let pixel = pixels.flat(s, dots);
-                match out.first_chunk_mut() {
-                    Some(out) => s.store_int(out, pixel),
-                    None => {
-                        let mut lanes = [0; LANES];
-                        s.store_int(&mut lanes, pixel);
-                        out.copy_from_slice(&lanes[..out.len()]);
-                    }
+        self.lines(
+            #[inline(always)]
+            |x, y, line| {
+                let terms = line_terms::<S, PAIRS>(s, p, x, y);
+                let (chunks, tail) = line.as_chunks_mut();
+                let (whole, rest) = zs.as_chunks();
+                for (z, out) in whole.iter().zip(chunks) {
+                    s.store_int(out, pixels.flat(s, dots::<S, PAIRS>(s, terms, slope, s.load(z))));
                 }
-            }
-        }
+                if !tail.is_empty() {
+                    let mut lanes = [0; LANES];
+                    s.store_int(&mut lanes, pixels.flat(s, dots::<S, PAIRS>(s, terms, slope, s.load_part(rest))));
+                    tail.copy_from_slice(&lanes[..rest.len()]);
+                }
+            },
+        );
     }
 }
 
@@ -204,8 +207,7 @@ impl<S: Simd> Pixels<S> {
     #[inline(always)]
     fn flat(&self, s: S, [u, v, d]: [S::V; 3]) -> S::I {
         let (u, v, zero) = (s.div(u, d), s.div(v, d), s.splat(0.0));
-        let inside = |t: S::V, last: S::V| s.both(s.at_least(t, zero), s.at_least(last, t));
-        let valid = s.both(s.at_least(d, zero), s.both(inside(u, self.last_column), inside(v, self.last_row)));
+        let valid = s.both(s.at_least(d, zero), s.both(inside(s, u, self.last_column), inside(s, v, self.last_row)));
         // Lanes that are not valid truncate to anything; the mask drops them.
         let column = s.shift_right(s.truncate(u), self.stride_log2);
         let row = s.shift_right(s.truncate(v), self.stride_log2);
@@ -213,21 +215,37 @@ impl<S: Simd> Pixels<S> {
     }
 }
 
+/// `0 <= t <= last`, false for NaN.
+#[inline(always)]
+fn inside<S: Simd>(s: S, t: S::V, last: S::V) -> S::M {
+    s.both(s.at_least(t, s.splat(0.0)), s.at_least(last, t))
+}
+
+/// The three rows' products: (first + slope * z) + second if `PAIRS`, else fma(slope, z, first) + second.
+#[inline(always)]
+fn dots<S: Simd, const PAIRS: bool>(s: S, [first, second]: [[S::V; 3]; 2], slope: [S::V; 3], z: S::V) -> [S::V; 3] {
+    let mut dots = second;
+    for r in 0..3 {
+        let head = if PAIRS { s.add(first[r], s.mul(slope[r], z)) } else { s.mul_add(slope[r], z, first[r]) };
+        dots[r] = s.add(head, second[r]);
+    }
+    dots
+}
+
 /// What a line of constant x and y adds before and after the term of z.
 #[inline(always)]
 fn line_terms<S: Simd, const PAIRS: bool>(s: S, p: &Projection, x: f32, y: f32) -> [[S::V; 3]; 2] {
-    let row = |r: usize| &p.matrix[r * 4..r * 4 + 4];
-    let first = core::array::from_fn(|r| {
-        let m = row(r);
-        s.splat(if PAIRS { m[0] * x } else { y.mul_add(m[1], m[0] * x) })
-    });
-    let second = core::array::from_fn(|r| {
-        let m = row(r);
-        s.splat(if PAIRS { m[1] * y + m[3] } else { m[3] })
-    });
+    let (mut first, mut second) = ([s.splat(0.0); 3], [s.splat(0.0); 3]);
+    for r in 0..3 {
+        let m = &p.matrix[r * 4..r * 4 + 4];
+        first[r] = s.splat(if PAIRS { m[0] * x } else { y.mul_add(m[1], m[0] * x) });
+        second[r] = s.splat(if PAIRS { m[1] * y + m[3] } else { m[3] });
+    }
     [first, second]
 }
 
+#[cfg(feature = "cases")]
+pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;

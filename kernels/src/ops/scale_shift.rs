@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! y = x * scale[c] + shift[c]        rounded once
-//! y = y + residual[row][c]           if there is a residual that comes before the rectifier
+//! y = y + residual[row][c]           if there is a residual that comes before ReLU
 //! y = if y < 0 { 0 } else { y }      if asked for; NaN stays
 //! y = y + residual[row][c]           if there is a residual that comes after it
 //! ```
@@ -29,7 +29,7 @@ pub struct ScaleShift<'a> {
     pub stride: usize,
     /// `[rows, stride]`, of which the scaled channels are added.
     pub residual: Option<&'a [f32]>,
-    /// Whether the residual is added after the rectifier instead of before.
+    /// Whether the residual is added after ReLU instead of before.
     pub residual_after: bool,
     /// Whether negative results become 0.
     pub relu: bool,
@@ -112,6 +112,8 @@ impl Kernel for Run<'_> {
     }
 }
 
+#[cfg(feature = "cases")]
+pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -150,7 +152,7 @@ mod tests {
             }
         }
 
-        /// The same channels amid others, with numbers of their own.
+        /// The same channels amid others, with values of their own.
         fn within(mut self, before: usize, after: usize, residual_after: bool, seed: u64, fill: Fill) -> Self {
             let rows = self.x.len() / self.stride;
             let mut rng = Rng::new(seed);
@@ -196,7 +198,7 @@ mod tests {
             assert_eq!(case.all(isa), [2.5, 19.0, 6.5, -41.0]);
             case.relu = true;
             assert_eq!(case.all(isa), [2.5, 19.0, 6.5, 0.0]);
-            // The rectifier comes after the residual: -41 + 50 stays.
+            // ReLU comes after the residual: -41 + 50 stays.
             case.residual = Some(vec![0.0, -20.0, 1.0, 50.0]);
             assert_eq!(case.all(isa), [2.5, 0.0, 7.5, 9.0]);
             case.residual_after = true;

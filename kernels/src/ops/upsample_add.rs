@@ -88,6 +88,8 @@ impl Kernel for Run<'_> {
     }
 }
 
+#[cfg(feature = "cases")]
+pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -4,7 +4,7 @@
 //! for each window, tokens t (row-major in the window), feature of head h:
 //!     feature[t]  = in[t][part h]                                    h = 0
 //!     feature[t]  = in[t][part h] + head[h - 1][t]                   h > 0: heads are cascaded
-//!     q, k, v     = qkv_bias[h] + feature[t] * qkv[h]                one fma chain per number, from the bias
+//!     q, k, v     = qkv_bias[h] + feature[t] * qkv[h]                one fma chain per value, from the bias
 //!     q           = query_bias[h] + 5x5 depthwise of q               zero padding at the window's border
 //!     score[t][u] = (0 + q[t] . k[u]) * (1 / sqrt(key_dim)) + offsets[h][|dx| * side + |dy|]
 //!     p[t][u]     = exp(score - max over u) / sum over u             on 16 lanes, see below
@@ -21,14 +21,16 @@
 //! 0; then halves, quarters, eighths and pairs (`if x[i + half] > x[i]`, and `+`).
 //!
 //! What the body changes, none of which can change a bit:
-//! 1. Keys (transposed) and values are packed into panels of 16 columns, so that the four products of a head are one
-//!    routine with tiles of 6 or 12 rows by 16 columns.
+//! 1. Keys (transposed) and values are packed into panels of 16 columns, so that the four products of a head run through the
+//!    register tile of [`crate::matmul`].
 //! 2. A head's output joins the next head's part in a copy of the window.
 //! 3. Queries lie amid zeros, so that no tap of their convolution needs a test.
 //! 4. The offsets are spread out to one row per token once per call; all windows of the call use them.
 //! 5. Lanes beyond the last token hold -inf for the maximum and 0 for the sum.
 
 mod body;
+#[cfg(feature = "cases")]
+pub(crate) mod cases;
 mod reference;
 #[cfg(test)]
 mod tests;
@@ -132,17 +134,17 @@ pub struct WindowAttention<'a> {
     pub input: &'a [f32],
     /// One packed matrix of `channels / heads` x `3 * key_dim` per head: the columns are q, then k, then v.
     pub qkv: &'a [f32],
-    /// `3 * key_dim` numbers per head, each head's padded with anything to a multiple of 16.
+    /// `3 * key_dim` values per head, each head's padded with anything to a multiple of 16.
     pub qkv_bias: &'a [f32],
     /// `[heads, 5, 5, key_dim]`, each tap's channels padded with anything to a multiple of 16.
     pub query: &'a [f32],
-    /// `key_dim` numbers per head, padded likewise.
+    /// `key_dim` values per head, padded likewise.
     pub query_bias: &'a [f32],
     /// `[heads, side * side]`, added to the score of two tokens (`dx`, `dy`) apart at `|dx| * side + |dy|`.
     pub offsets: &'a [f32],
     /// The packed matrix of `heads * key_dim` x `channels`.
     pub proj: &'a [f32],
-    /// One number per channel, padded with anything to a multiple of 16.
+    /// One value per channel, padded with anything to a multiple of 16.
     pub proj_bias: &'a [f32],
 }
 
@@ -167,7 +169,7 @@ impl WindowAttention<'_> {
 }
 
 /// Computes the windows of row `window_row` into `out`, `[rows, extent 1, channels]`: exactly the plane's rows
-/// [`Shape::rows`]. `scratch` holds at least [`Shape::scratch_len`] numbers of any value.
+/// [`Shape::rows`]. `scratch` holds at least [`Shape::scratch_len`] values of any value.
 ///
 /// # Panics
 /// If there is no such row of windows, the heads do not fit the channels, or a slice does not have the size that the
@@ -199,7 +201,7 @@ struct Scratch<'a> {
     scores: &'a mut [f32],
     /// `[tokens, padded key_dim]`: the head's output.
     head: &'a mut [f32],
-    /// `[tokens, heads * key_dim]`, rectified.
+    /// `[tokens, heads * key_dim]`, after ReLU.
     heads: &'a mut [f32],
     /// `[tokens, padded channels]`.
     proj: &'a mut [f32],

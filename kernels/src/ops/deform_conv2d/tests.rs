@@ -359,7 +359,7 @@ fn the_scalar_code_agrees_with_f64() {
     for (i, (walk, columns)) in table().into_iter().enumerate() {
         for way in [PLAIN, ways()[i % 16]] {
             let case = Case::new(walk, columns, way, 6, Rng::ordinary);
-            // Four products and a mask before each of the chain's add a few roundings of numbers below 1.
+            // Four products and a mask before each of the chain's add a few roundings of values below 1.
             assert_close(&case.all(Isa::Scalar), &case.naive(), 3e-5, &format!("{walk:?} {way:?}"));
         }
     }

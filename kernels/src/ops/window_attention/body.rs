@@ -2,8 +2,12 @@
 
 use super::{QUERY_KERNEL, SIDE, Scratch, Shape, WindowAttention, tree_max};
 use crate::math::exp_v;
+use crate::matmul::Residual;
+use crate::matmul::driver::Dense;
+use crate::matmul::epilogue::End;
 use crate::matmul::layout::packed_len;
-use crate::simd::{LANES, Simd, TileRows, relu, tree_sum};
+use crate::matmul::tile::Single;
+use crate::simd::{LANES, Simd, relu, tree_sum};
 use core::ops::Range;
 
 /// Zeros before and after each axis of the queries.
@@ -54,7 +58,7 @@ impl WindowAttention<'_> {
         let weights = packed_len(part, 3 * key_dim);
         let weights = &self.qkv[head * weights..(head + 1) * weights];
         let bias = &self.qkv_bias[head * columns..(head + 1) * columns];
-        let a = Rows { values: &scratch.window[head * part..], stride: channels };
+        let a = Dense::new(&scratch.window[head * part..], channels, part);
         product(s, a, weights, Some(bias), scratch.qkv, columns);
 
         let (keys, values) = scratch.packed.split_at_mut(packed_len(key_dim, tokens));
@@ -81,12 +85,12 @@ impl WindowAttention<'_> {
         let tokens = self.shape.tokens();
         let (pad, padded) = (key_dim.next_multiple_of(LANES), tokens.next_multiple_of(LANES));
         let (keys, values) = scratch.packed.split_at(packed_len(key_dim, tokens));
-        product(s, Rows { values: scratch.query, stride: pad }, keys, None, scratch.scores, padded);
+        product(s, Dense::new(scratch.query, pad, key_dim), keys, None, scratch.scores, padded);
         let offsets = &scratch.offsets[head * tokens * padded..(head + 1) * tokens * padded];
         for (scores, offsets) in scratch.scores.chunks_exact_mut(padded).zip(offsets.chunks_exact(padded)) {
             softmax(s, scores, offsets, tokens, self.scale());
         }
-        product(s, Rows { values: scratch.scores, stride: padded }, values, None, scratch.head, pad);
+        product(s, Dense::new(scratch.scores, padded, tokens), values, None, scratch.head, pad);
         for (t, out) in scratch.head.chunks_exact(pad).enumerate() {
             let all = &mut scratch.heads[(t * heads + head) * key_dim..][..key_dim];
             for (all, x) in all.iter_mut().zip(out) {
@@ -113,7 +117,7 @@ impl WindowAttention<'_> {
     ) {
         let Shape { extent, channels, heads, key_dim, .. } = self.shape;
         let (columns, width) = (channels.next_multiple_of(LANES), self.shape.window()[1]);
-        let a = Rows { values: scratch.heads, stride: heads * key_dim };
+        let a = Dense::new(scratch.heads, heads * key_dim, heads * key_dim);
         product(s, a, self.proj, Some(self.proj_bias), scratch.proj, columns);
         for (t, y) in scratch.proj.chunks_exact(columns).enumerate() {
             let (row, column) = (t / width, window * width + t % width);
@@ -129,7 +133,7 @@ impl WindowAttention<'_> {
     }
 }
 
-/// Copies all of `from` to the start of `to`. A loop, as it is a handful of numbers.
+/// Copies all of `from` to the start of `to`. A loop, as it is a handful of values.
 #[inline(always)]
 fn copy(from: &[f32], to: &mut [f32]) {
     for (from, to) in from.iter().zip(to) {
@@ -185,7 +189,7 @@ fn convolve_tile<S: Simd, const N: usize>(
     }
 }
 
-/// The first 16 numbers of a slice that has them.
+/// The first 16 values of a slice that has them.
 #[inline(always)]
 fn lanes(x: &[f32]) -> &[f32; LANES] {
     x.first_chunk().expect("rows are padded to whole vectors")
@@ -227,53 +231,10 @@ fn softmax<S: Simd>(s: S, scores: &mut [f32], offsets: &[f32], tokens: usize, sc
     }
 }
 
-/// The left matrix of a [`product`]: rows `stride` apart, the first one at the start of `values`.
-#[derive(Clone, Copy)]
-struct Rows<'a> {
-    values: &'a [f32],
-    stride: usize,
-}
-
-/// `out[r][n] = bias[n] + a[r][0] * w[0][n] + a[r][1] * w[1][n] + ...`, one chain, for all columns of the packed panels.
-///
-/// A row of `out` has `columns` numbers, a multiple of 16; `weights` are `columns / 16` panels, which gives the depth, and
-/// rows of `a` may go on beyond it. Without a bias the chain starts at 0.
+/// `out[r][n] = bias[n] + left[r][0] * w[0][n] + left[r][1] * w[1][n] + ...`, one chain, for all columns of the packed
+/// panels. A row of `out` has `columns` values, a multiple of 16. Without a bias the chain starts at 0.
 #[inline(always)]
-fn product<S: Simd>(s: S, a: Rows<'_>, weights: &[f32], bias: Option<&[f32]>, out: &mut [f32], columns: usize) {
-    let (panel_len, rows) = (weights.len() / columns * LANES, out.len() / columns);
-    for (i, panel) in weights.chunks_exact(panel_len).enumerate() {
-        let (panel, _) = panel.as_chunks();
-        let start = s.load(bias.map_or(&[0.0; LANES], |bias| lanes(&bias[i * LANES..])));
-        let mut r = 0;
-        while r < rows {
-            let a = Rows { values: &a.values[r * a.stride..], ..a };
-            r += s.rows(rows - r, Tile { a, panel, start, out: &mut out[r * columns + i * LANES..], columns });
-        }
-    }
-}
-
-/// Some rows of one panel of [`product`]; `out` starts at the first row's first column.
-struct Tile<'a, V> {
-    a: Rows<'a>,
-    panel: &'a [[f32; LANES]],
-    start: V,
-    out: &'a mut [f32],
-    columns: usize,
-}
-
-impl<S: Simd> TileRows<S> for Tile<'_, S::V> {
-    #[inline(always)]
-    fn run<const N: usize>(self, s: S) {
-        let rows: [&[f32]; N] = core::array::from_fn(|r| &self.a.values[r * self.a.stride..][..self.panel.len()]);
-        let mut sums = [self.start; N];
-        for (k, w) in self.panel.iter().enumerate() {
-            let w = s.load(w);
-            for (sum, row) in sums.iter_mut().zip(rows) {
-                *sum = s.mul_add(s.splat(row[k]), w, *sum);
-            }
-        }
-        for (r, sum) in sums.into_iter().enumerate() {
-            s.store(lanes_mut(&mut self.out[r * self.columns..]), sum);
-        }
-    }
+fn product<S: Simd>(s: S, left: Dense<'_, f32>, panels: &[f32], bias: Option<&[f32]>, out: &mut [f32], columns: usize) {
+    let mut end = End { bias, relu: false, residual: Residual::None };
+    left.product::<Single, S, _>(s, panels, &mut end, out, columns);
 }

@@ -59,7 +59,7 @@ impl Case {
     }
 
     fn window_row(&self, isa: Isa, row: usize) -> Vec<f32> {
-        // Neither NaN nor a large number from an earlier call may show.
+        // Neither NaN nor a large value from an earlier call may show.
         let mut rng = Rng::new(99);
         let mut junk = || [f32::NAN, 1e20, -1e20, 7.0][rng.bits() as usize % 4];
         let mut scratch: Vec<f32> = (0..self.shape.scratch_len()).map(|_| junk()).collect();

@@ -1,0 +1,111 @@
+//! What is known of every kernel from one line in [`REGISTRY`]: how to call it with any arguments, and at the network's
+//! shapes.
+//!
+//! Tests take from it that every instruction set gives the bits of the specification and stays inside its slices, the fuzz
+//! target any shapes and bits, the benchmarks their work. A kernel's part lies beside it, in `ops/KERNEL/cases.rs`.
+
+mod bench;
+pub(crate) mod draw;
+mod memory;
+
+pub use bench::{Bench, values};
+pub use draw::{Draw, MAX_WORK, Weights};
+pub use memory::{Held, Memory, Plain};
+
+use crate::isa::Isa;
+use crate::ops;
+use std::boxed::Box;
+use std::format;
+use std::string::String;
+use std::vec::Vec;
+
+/// A kernel that is known.
+#[derive(Clone, Copy)]
+pub struct Entry {
+    /// The name of its file in `ops`.
+    pub name: &'static str,
+    /// A call with arguments that are drawn, unless it would be too much work.
+    pub draw: fn(&mut Draw) -> Option<Box<dyn Case>>,
+    /// Its work in the network.
+    pub benches: fn() -> Vec<Bench>,
+}
+
+/// One call of a kernel with its arguments.
+pub trait Case {
+    /// Calls it with slices in `memory` that are exactly as long as they must be.
+    fn run(&self, isa: Isa, memory: Memory) -> Output;
+}
+
+/// What a call returned and wrote.
+#[derive(Clone, Debug, Default)]
+pub struct Output {
+    /// Values, any NaN being equal to any NaN.
+    pub values: Vec<f32>,
+    /// Classes, pixels and truth.
+    pub codes: Vec<u32>,
+}
+
+impl From<&[f32]> for Output {
+    fn from(values: &[f32]) -> Self {
+        Self { values: values.to_vec(), codes: Vec::new() }
+    }
+}
+
+impl Output {
+    /// The first difference in bits, in words.
+    pub fn difference(&self, want: &Self) -> Option<String> {
+        if [self.values.len(), self.codes.len()] != [want.values.len(), want.codes.len()] {
+            return Some("lengths differ".into());
+        }
+        let same = |(a, b): (&f32, &f32)| a.to_bits() == b.to_bits() || (a.is_nan() && b.is_nan());
+        if let Some(i) = self.values.iter().zip(&want.values).position(|pair| !same(pair)) {
+            return Some(format!("value {i} is {:e}, not {:e}", self.values[i], want.values[i]));
+        }
+        let i = self.codes.iter().zip(&want.codes).position(|(a, b)| a != b)?;
+        Some(format!("code {i} is {}, not {}", self.codes[i], want.codes[i]))
+    }
+}
+
+/// Runs `case` in each of `memories` on every instruction set, and on no other before.
+///
+/// # Panics
+/// If one gives other bits than the specification.
+pub fn agree(name: &str, case: &dyn Case, memories: &[Memory]) -> Output {
+    let want = case.run(Isa::Scalar, Memory::Heap);
+    for &memory in memories {
+        for isa in Isa::available() {
+            if let Some(difference) = case.run(isa, memory).difference(&want) {
+                panic!("{name} on {} in {memory:?}: {difference}", isa.name());
+            }
+        }
+    }
+    want
+}
+
+macro_rules! registry {
+    ($($kernel:ident)*) => {
+        /// Every kernel.
+        pub const REGISTRY: &[Entry] = &[$(Entry {
+            name: stringify!($kernel),
+            draw: |draw| Some(Box::new(ops::$kernel::cases::draw(draw)?)),
+            benches: ops::$kernel::cases::benches,
+        }),*];
+    };
+}
+
+registry! {
+    conv
+    deconv3d
+    deform_conv2d
+    depthwise
+    gate
+    gather
+    head
+    max_pool
+    normalise
+    pool
+    project
+    scale_shift
+    upsample_add
+    window_attention
+}
