@@ -108,4 +108,5 @@ registry! {
     scale_shift
     upsample_add
     window_attention
+    winograd
 }

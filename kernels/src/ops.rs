@@ -14,3 +14,4 @@ pub mod project;
 pub mod scale_shift;
 pub mod upsample_add;
 pub mod window_attention;
+pub mod winograd;

@@ -282,7 +282,7 @@ impl Entry<'_> {
 }
 
 /// Keys of a camera that are used.
-const KEYS: [&str; 7] = ["name", "file", "width", "height", "intrinsic", "lidar2camera", "lidar2img"];
+const KEYS: [&str; 8] = ["name", "file", "width", "height", "stamp", "intrinsic", "lidar2camera", "lidar2img"];
 
 fn read_camera(index: usize, value: &Value, unused: &mut Vec<String>, notes: &mut Vec<Note>) -> Result<Camera> {
     let Some(keys) = value.as_object() else {

@@ -1,0 +1,104 @@
+//! Which convolutions are worth it.
+
+use super::{Scheme, Shape};
+use crate::conv::Geometry;
+use crate::simd::LANES;
+
+/// What reading one number of transformed weights costs, in multiply-adds.
+const WEIGHT: u128 = 8;
+/// What one point of one channel costs in either transform, in multiply-adds.
+const TRANSFORM: u128 = 14;
+
+impl Shape {
+    /// The shape by which a convolution to `columns` channels is computed fastest within the error of [`Shape::accurate`], or
+    /// none if a direct sum is.
+    ///
+    /// Costs are counted in multiply-adds, from the shape alone: the sums, which take a quarter longer in groups and an eighth
+    /// longer in a direct sum than the multiply-adds alone; both transforms, 14 per number; the weights, which are
+    /// read from far away, 8 per number. Winograd must save an eighth.
+    pub fn best(geometry: &Geometry, columns: usize) -> Option<Self> {
+        let padded = columns.next_multiple_of(LANES) as u128;
+        let products = geometry.depth() as u128 * padded;
+        let direct = geometry.rows() as u128 * products * 9 / 8 + WEIGHT * products;
+        [Scheme::Two, Scheme::Four]
+            .into_iter()
+            .filter_map(|scheme| Self::of(geometry, columns, scheme))
+            .filter(Self::accurate)
+            .map(|shape| (shape.cost(), shape))
+            .min_by_key(|(cost, _)| *cost)
+            .filter(|(cost, _)| *cost <= direct / 8 * 7)
+            .map(|(_, shape)| shape)
+    }
+
+    fn cost(&self) -> u128 {
+        let [down, across] = self.tiles().map(|v| v as u128);
+        let numbers = down * across * (self.layers * self.scheme.points()) as u128;
+        let (depth, columns) = (self.depth() as u128, self.columns.next_multiple_of(LANES) as u128);
+        numbers * (depth * columns * 5 / 4 + TRANSFORM * (self.channels as u128 + columns))
+            + WEIGHT * self.scheme.points() as u128 * depth * columns
+    }
+
+    /// Whether the error is at most twice that of a direct sum. F(4,3) amplifies the rounding of its transforms, beside which
+    /// a direct sum of few products has little.
+    pub fn accurate(&self) -> bool {
+        self.scheme == Scheme::Two || self.depth() >= 32
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn best(input: [usize; 3], kernel: [usize; 3], channels: usize, columns: usize) -> Option<Scheme> {
+        let padding = kernel.map(|k| k / 2);
+        let geometry = Geometry { input, channels, kernel, stride: [1; 3], dilation: [1; 3], padding, output: input };
+        Shape::best(&geometry, columns).map(|shape| shape.scheme)
+    }
+
+    #[test]
+    fn the_choice_follows_from_the_shape() {
+        let (plane, cube) = ([1, 3, 3], [3; 3]);
+        for (input, kernel, channels, columns, want) in [
+            ([1, 232, 400], plane, 64, 64, Some(Scheme::Four)),
+            ([1, 58, 100], plane, 256, 27, Some(Scheme::Four)),
+            ([1, 29, 50], plane, 512, 512, Some(Scheme::Four)),
+            ([1, 32, 88], plane, 32, 32, Some(Scheme::Four)),
+            ([200, 200, 16], cube, 32, 32, Some(Scheme::Four)),
+            ([104, 104, 8], cube, 16, 16, Some(Scheme::Four)),
+            ([13, 13, 1], cube, 64, 64, Some(Scheme::Four)),
+            // Few tiles: weights decide.
+            ([1, 4, 11], plane, 256, 256, Some(Scheme::Two)),
+            ([1, 1, 1], plane, 256, 256, None),
+            // Few channels: the transforms cost more than they save.
+            ([1, 232, 400], plane, 16, 16, None),
+            // Not a convolution that the kernel computes.
+            ([1, 232, 400], [1; 3], 64, 64, None),
+            ([1, 928, 1600], plane, 3, 64, None),
+            ([1, 58, 100], plane, 40, 64, None),
+        ] {
+            assert_eq!(best(input, kernel, channels, columns), want, "{input:?} {kernel:?} {channels}-{columns}");
+        }
+    }
+
+    #[test]
+    fn strides_and_dilations_are_left_alone() {
+        let sound = Geometry {
+            input: [1, 58, 100],
+            channels: 64,
+            kernel: [1, 3, 3],
+            stride: [1; 3],
+            dilation: [1; 3],
+            padding: [0, 1, 1],
+            output: [1, 58, 100],
+        };
+        assert!(Shape::best(&sound, 64).is_some());
+        for geometry in [
+            Geometry { stride: [1, 2, 2], output: [1, 29, 50], ..sound },
+            Geometry { dilation: [1, 2, 2], padding: [0, 2, 2], ..sound },
+            Geometry { padding: [0; 3], output: [1, 56, 98], ..sound },
+            Geometry { input: [2, 58, 100], output: [2, 58, 100], ..sound },
+        ] {
+            assert_eq!(Shape::best(&geometry, 64), None, "{geometry:?}");
+        }
+    }
+}
