@@ -277,7 +277,7 @@ impl Session {
     }
 
     /// Takes the last complete result out of the session, without copying it; none before the first frame, or where it was
-    /// taken already. The session goes on with the memory of `spare`, a result of its own that nobody needs any more, and
+    /// taken already. The session goes on with the memory of `spare`, a result of any session of its layout that nobody needs any more, and
     /// without one allocates as much. [`Session::memory`] does not count results that were taken.
     ///
     /// # Errors

@@ -80,8 +80,9 @@ impl OwnedOccupancy {
         self.output.occupancy(self.grid)
     }
 
+    /// The memory, for another result. What the support was counted for is forgotten: it may have been another session's.
     pub(super) fn into_output(self) -> Output {
-        self.output
+        Output { visibility: 0, ..self.output }
     }
 }
 

@@ -139,3 +139,20 @@ fn results_that_are_taken_out_stay_and_lend_their_memory() {
     assert!(places.contains(&place));
     assert_eq!(digest(&second.view()), expected[1]);
 }
+
+#[test]
+fn the_memory_of_another_sessions_result_does_not_lend_its_support() {
+    let pixels = vec![9u8; 32 * 64 * 3];
+    let images = [ImageView::bgr(32, 64, &pixels); 2];
+    let turned = || Session::new(model(), small::rig(&tiny(), 0.0), &SessionOptions::default()).expect("a session");
+    let expected = turned().run(&images).expect("a frame").support.to_vec();
+    let mut other = session();
+    assert_ne!(other.run(&images).expect("a frame").support, expected, "rigs that can be told apart");
+    let mut session = turned();
+    session.run(&images).expect("a frame");
+    let spare = other.take(None).expect("memory");
+    session.take(spare).expect("memory").expect("a result");
+    for _ in 0..3 {
+        assert_eq!(session.run(&images).expect("a frame").support, expected);
+    }
+}
