@@ -1,8 +1,9 @@
-//! What is known of every kernel from one line in [`REGISTRY`]: how to call it with any arguments, and at the network's
-//! shapes.
+//! What is known of every kernel from its line in [`REGISTRY`], which stands in `ops.rs`: how to call it with any arguments,
+//! and at the network's shapes.
 //!
 //! Tests take from it that every instruction set gives the bits of the specification and stays inside its slices, the fuzz
-//! target any shapes and bits, the benchmarks their work. A kernel's part lies beside it, in `ops/KERNEL/cases.rs`.
+//! target any shapes and bits, the benchmarks their work. A kernel's part is its module `cases`: a file beside it,
+//! `ops/KERNEL/cases.rs`, or some lines in its own.
 
 mod bench;
 pub(crate) mod draw;
@@ -12,8 +13,9 @@ pub use bench::{Bench, values};
 pub use draw::{Draw, MAX_WORK, Weights};
 pub use memory::{Held, Memory, Plain};
 
+pub use crate::ops::REGISTRY;
+
 use crate::isa::Isa;
-use crate::ops;
 use std::boxed::Box;
 use std::format;
 use std::string::String;
@@ -80,33 +82,4 @@ pub fn agree(name: &str, case: &dyn Case, memories: &[Memory]) -> Output {
         }
     }
     want
-}
-
-macro_rules! registry {
-    ($($kernel:ident)*) => {
-        /// Every kernel.
-        pub const REGISTRY: &[Entry] = &[$(Entry {
-            name: stringify!($kernel),
-            draw: |draw| Some(Box::new(ops::$kernel::cases::draw(draw)?)),
-            benches: ops::$kernel::cases::benches,
-        }),*];
-    };
-}
-
-registry! {
-    conv
-    deconv3d
-    deform_conv2d
-    depthwise
-    gate
-    gather
-    head
-    max_pool
-    normalise
-    pool
-    project
-    scale_shift
-    upsample_add
-    window_attention
-    winograd
 }

@@ -15,3 +15,35 @@ pub mod scale_shift;
 pub mod upsample_add;
 pub mod window_attention;
 pub mod winograd;
+
+/// Makes the registry of a list of kernels.
+#[cfg(feature = "cases")]
+macro_rules! registry {
+    ($($kernel:ident)*) => {
+        /// Every kernel.
+        pub const REGISTRY: &[crate::cases::Entry] = &[$(crate::cases::Entry {
+            name: stringify!($kernel),
+            draw: |draw| Some(std::boxed::Box::new($kernel::cases::draw(draw)?)),
+            benches: $kernel::cases::benches,
+        }),*];
+    };
+}
+
+#[cfg(feature = "cases")]
+registry! {
+    conv
+    deconv3d
+    deform_conv2d
+    depthwise
+    gate
+    gather
+    head
+    max_pool
+    normalise
+    pool
+    project
+    scale_shift
+    upsample_add
+    window_attention
+    winograd
+}
