@@ -163,7 +163,10 @@ fn inverse(matrix: &[f64; 12]) -> Result<[f64; 12]> {
     let row = |r: usize| [matrix[4 * r], matrix[4 * r + 1], matrix[4 * r + 2]];
     let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
     let rigid = (0..3).all(|i| (0..3).all(|j| (dot(row(i), row(j)) - f64::from(u8::from(i == j))).abs() < 1e-3));
-    if !rigid {
+    let [[a, b, c], [d, e, f], third] = [row(0), row(1), row(2)];
+    let cross = [b * f - c * e, c * d - a * f, a * e - b * d];
+    // Right angles alone would let a mirror pass.
+    if !rigid || dot(cross, third) < 0.0 {
         return Err(Error::format("camera to lidar is no rotation, expected rows of length 1 at right angles"));
     }
     let shift = [3, 7, 11].map(|i| matrix[i]);
