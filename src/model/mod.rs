@@ -156,7 +156,7 @@ impl Model {
     /// Writes the model to `path`, as it is, by way of a temporary file beside it.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`](crate::ErrorKind::Io) if the system refuses.
+    /// [`ErrorKind::Io`] if the system refuses.
     pub fn save(&self, path: &Path) -> Result<()> {
         let tensors = self.contents().map(|(name, dtype, shape, bytes)| {
             let shape = shape.to_vec();
