@@ -34,7 +34,7 @@ pub struct Demo {
     /// Directory for scene/, model, rig, occupancy, picture and page
     #[arg(short, long, value_name = "DIR", default_value = "voxcast-demo")]
     output: PathBuf,
-    /// Which street is drawn; the network was trained on 0 to 2419
+    /// Which street is drawn; the network was trained on 0 to 5434
     #[arg(long, default_value_t = 1_000_006)]
     seed: u64,
     #[command(flatten)]
@@ -119,7 +119,9 @@ fn draw(path: &Path, network: &Network, drawn: &Frame, result: &Occupancy<'_>, s
     let occupancies =
         [occupancy("prediction", result.classes)?.with_support(result.support)?, occupancy("truth", &drawn.labels)?];
     let images: Vec<_> = drawn.scene.names.iter().map(String::as_str).zip(&drawn.scene.images).collect();
-    let subtitle = format!("six cameras of 128 x 352 pixels, a street that the network was not trained on: {score}");
+    let [height, width] = network.image;
+    let subtitle =
+        format!("six cameras of {height} x {width} pixels, a street that the network was not trained on: {score}");
     let figure = Figure {
         title: "voxcast demo",
         subtitle: &subtitle,
