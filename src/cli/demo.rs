@@ -53,8 +53,7 @@ impl Demo {
         let network = model.network();
         let start = Instant::now();
         let drawn = Synthesiser::new(network)?.frame(self.seed);
-        let grid = network.output_grid();
-        drawn.save_scene(&directory.join("scene"), grid)?;
+        drawn.save_scene(&directory.join("scene"), Grid::of(network))?;
         println!("street of seed {} drawn in {}", self.seed, terminal::time(start.elapsed()));
 
         let start = Instant::now();
@@ -114,7 +113,7 @@ fn score(drawn: &Frame, result: &Occupancy<'_>) -> String {
 /// The picture: images, prediction and truth.
 fn draw(path: &Path, network: &Network, drawn: &Frame, result: &Occupancy<'_>, score: &str) -> Result<()> {
     let palette = Palette::of(network.classes);
-    let grid = Grid::of(network);
+    let grid = result.grid;
     let occupancy = |caption, classes| picture::Occupancy::new(caption, classes, grid, grid.forward());
     let occupancies =
         [occupancy("prediction", result.classes)?.with_support(result.support)?, occupancy("truth", &drawn.labels)?];

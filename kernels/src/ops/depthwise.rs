@@ -199,7 +199,6 @@ mod tests {
     use crate::testing::{
         Fill, Rng, assert_close, assert_lively, assert_order_shows, assert_same_bits, pad_rows, reverse_rows,
     };
-    use proptest::prelude::*;
 
     struct Case {
         shape: [usize; 3],
@@ -289,21 +288,6 @@ mod tests {
             assert!(out[3].is_nan());
             assert!(out[(9 + 1) * 16 + 3].is_infinite());
             assert!(out.iter().skip(4).step_by(16).all(|v| v.is_finite()));
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn any_shape_gives_the_scalar_bits(
-            h in 1usize..6, w in 1usize..14, c in 1usize..40, half in 0usize..4, residual: bool, seed: u64,
-        ) {
-            let case = Case::new([h, w, c], 2 * half + 1, residual, seed, Rng::fill_of(seed));
-            let want = case.all(Isa::Scalar);
-            for isa in Isa::available() {
-                assert_same_bits(&case.all(isa), &want, "whole");
-                let split = h / 2;
-                assert_same_bits(&[case.rows(isa, 0..split), case.rows(isa, split..h)].concat(), &want, "split");
-            }
         }
     }
 

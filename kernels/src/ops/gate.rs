@@ -113,7 +113,6 @@ mod tests {
     use crate::testing::{
         Fill, Rng, assert_close, assert_lively, assert_order_shows, assert_same_bits, pad_rows, reverse_columns,
     };
-    use proptest::prelude::*;
 
     struct Case {
         shape: [usize; 3],
@@ -183,23 +182,6 @@ mod tests {
             x[i * 64 + 5] = v;
         }
         x
-    }
-
-    proptest! {
-        #[test]
-        fn any_shape_gives_the_scalar_bits(columns in 0usize..7, depth in 1usize..20, channels in 1usize..70, seed: u64) {
-            let case = Case::new([columns, depth, channels], seed, Rng::fill_of(seed));
-            let want = case.all(Isa::Scalar);
-            for isa in Isa::available() {
-                assert_same_bits(&case.all(isa), &want, "whole");
-                let mut split = case.volume.clone();
-                let at = columns / 2 * channels;
-                let (left, right) = split.split_at_mut(at * depth);
-                gate(isa, &Gate { bev: &case.bev[..at], ..case.args() }, left);
-                gate(isa, &Gate { bev: &case.bev[at..], ..case.args() }, right);
-                assert_same_bits(&split, &want, "split");
-            }
-        }
     }
 
     #[test]

@@ -125,7 +125,6 @@ pub(crate) mod cases;
 mod tests {
     use super::*;
     use crate::testing::{Fill, Rng, assert_lively, assert_same_bits};
-    use proptest::prelude::*;
 
     fn args(
         input: &[f32],
@@ -193,25 +192,6 @@ mod tests {
                 for isa in Isa::available() {
                     assert_same_bits(&all(isa, &args), &want, &format!("{isa:?} {shape:?} {window:?}"));
                 }
-            }
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn any_shape_gives_the_scalar_bits(
-            h in 1usize..9, w in 1usize..9, c in 1usize..40, kernel in 1usize..5, stride in 1usize..4, seed: u64,
-        ) {
-            let padding = (seed % kernel as u64) as usize;
-            prop_assume!(h.min(w) + 2 * padding >= kernel);
-            let input = Rng::fill_of(seed)(&mut Rng::new(seed), h * w * c);
-            let args = args(&input, [h, w, c], [kernel, stride, padding]);
-            let want = all(Isa::Scalar, &args);
-            let height = args.output()[0];
-            for isa in Isa::available() {
-                assert_same_bits(&all(isa, &args), &want, "whole");
-                let split = [rows(isa, &args, 0..height / 2), rows(isa, &args, height / 2..height)].concat();
-                assert_same_bits(&split, &want, "split");
             }
         }
     }

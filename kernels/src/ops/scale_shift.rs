@@ -118,7 +118,6 @@ pub(crate) mod cases;
 mod tests {
     use super::*;
     use crate::testing::{Fill, Rng, assert_close, assert_lively, assert_order_shows, assert_same_bits, pad_rows};
-    use proptest::prelude::*;
 
     struct Case {
         channels: usize,
@@ -231,29 +230,6 @@ mod tests {
                         }
                     }
                 }
-            }
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn any_shape_gives_the_scalar_bits(
-            rows in 0usize..12, channels in 1usize..70, before in 0usize..20, residual: bool, after: bool, relu: bool,
-            seed: u64,
-        ) {
-            let case = Case::new(rows, channels, residual, relu, seed, Rng::fill_of(seed));
-            let case = case.within(before, before / 2, after, seed, Rng::fill_of(seed));
-            let want = case.all(Isa::Scalar);
-            for isa in Isa::available() {
-                assert_same_bits(&case.all(isa), &want, "whole");
-                let mut split = case.x.clone();
-                let at = rows / 2 * case.stride;
-                let (top, bottom) = split.split_at_mut(at);
-                for (part, range) in [(top, 0..at), (bottom, at..rows * case.stride)] {
-                    let residual = case.residual.as_ref().map(|r| &r[range]);
-                    scale_shift(isa, &ScaleShift { residual, ..case.args() }, part);
-                }
-                assert_same_bits(&split, &want, "split");
             }
         }
     }

@@ -94,7 +94,6 @@ pub(crate) mod cases;
 mod tests {
     use super::*;
     use crate::testing::{Fill, Rng, assert_close, assert_lively, assert_same_bits};
-    use proptest::prelude::*;
 
     fn args(
         low: &[f32],
@@ -146,27 +145,6 @@ mod tests {
                 for isa in Isa::available() {
                     assert_same_bits(&all(isa, &args, &large), &want, &format!("{isa:?} {low:?} {high:?}"));
                 }
-            }
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn any_shape_gives_the_scalar_bits(
-            lh in 1usize..6, lw in 1usize..6, h in 1usize..8, w in 1usize..8, c in 1usize..40, seed: u64,
-        ) {
-            let mut rng = Rng::new(seed);
-            let fill = Rng::fill_of(seed);
-            let (small, large) = (fill(&mut rng, lh * lw * c), fill(&mut rng, h * w * c));
-            let args = args(&small, [lh, lw], [h, w, c]);
-            let want = all(Isa::Scalar, &args, &large);
-            for isa in Isa::available() {
-                assert_same_bits(&all(isa, &args, &large), &want, "whole");
-                let mut split = large.clone();
-                let (top, bottom) = split.split_at_mut(h / 2 * w * c);
-                upsample_add(isa, &args, 0..h / 2, top);
-                upsample_add(isa, &args, h / 2..h, bottom);
-                assert_same_bits(&split, &want, "split");
             }
         }
     }
