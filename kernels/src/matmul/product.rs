@@ -97,7 +97,7 @@ impl Product<'_> {
         let (block, panels) = scratch[..SCRATCH].split_at_mut(BLOCK_LEN);
         let product =
             driver::Product { left, weights: &self.weights, target, depth: self.depth, columns: self.columns };
-        product.compute::<Single, S, _>(s, &mut self.end(), rows, out, block, panels);
+        product.compute(s, Single, &mut self.end(), rows, out, block, panels);
     }
 }
 

@@ -171,7 +171,7 @@ impl Kernel for Run<'_> {
                         target.residual_row(row),
                         out,
                         #[inline(always)]
-                        |k| conv.element(row, k),
+                        |k| conv.walk().element(row, k),
                     );
                 }
             },
@@ -182,7 +182,7 @@ impl Kernel for Run<'_> {
     fn run<S: Simd>(self, s: S) {
         self.each(
             #[inline(always)]
-            |conv, rows, target, out, scratch| conv.product.compute(s, conv, target, rows, out, scratch),
+            |conv, rows, target, out, scratch| conv.product.compute(s, &conv.walk(), target, rows, out, scratch),
         );
     }
 }
