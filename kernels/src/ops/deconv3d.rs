@@ -13,6 +13,7 @@
 use crate::isa::Isa;
 use crate::matmul::driver::{Source, Target};
 use crate::matmul::layout::packed_len;
+use crate::matmul::product::Multiply;
 use crate::matmul::{Panels, Product, Residual};
 use crate::ops::conv::{Conv, Geometry};
 use crate::simd::{Kernel, Simd, dispatch};

@@ -1,6 +1,7 @@
 //! How convolutions walk their input, whatever it is made of.
 
 use crate::matmul::driver::{PIECES, Source, depth};
+use crate::simd::bytes::GROUP;
 use crate::simd::{LANES, Simd};
 use core::ops::Range;
 
@@ -39,6 +40,12 @@ impl Geometry {
     pub(crate) fn position(&self, row: usize) -> [usize; 3] {
         let [_, h, w] = self.output;
         [row / (h * w), row / w % h, row % w]
+    }
+
+    /// # Panics
+    /// If the channels are no multiple of 4, which products of bytes take at once.
+    pub(crate) fn check_groups(&self) {
+        assert!(self.channels.is_multiple_of(GROUP), "the channels are no multiple of 4");
     }
 
     /// # Panics
