@@ -8,8 +8,9 @@
 mod bench;
 pub(crate) mod draw;
 mod memory;
+pub(crate) mod right_i8;
 
-pub use bench::{Bench, values};
+pub use bench::{Bench, Element, bytes, values};
 pub use draw::{Draw, MAX_WORK, Weights};
 pub use memory::{Held, Memory, Plain};
 
@@ -43,13 +44,19 @@ pub trait Case {
 pub struct Output {
     /// Values, any NaN being equal to any NaN.
     pub values: Vec<f32>,
-    /// Classes, pixels and truth.
-    pub codes: Vec<u32>,
+    /// Integers, classes, pixels and truth.
+    pub codes: Vec<i64>,
 }
 
 impl From<&[f32]> for Output {
     fn from(values: &[f32]) -> Self {
         Self { values: values.to_vec(), codes: Vec::new() }
+    }
+}
+
+impl From<&[i8]> for Output {
+    fn from(values: &[i8]) -> Self {
+        Self { values: Vec::new(), codes: values.iter().copied().map(i64::from).collect() }
     }
 }
 

@@ -7,7 +7,7 @@
 //! - `simd`: sixteen virtual lanes, a file per instruction set.
 //! - [`matmul`]: the matrix product and the layout of its weights.
 //! - [`ops`]: a file per operation. Each is also at the root of the crate.
-//! - [`math`], [`peak`]: exp and sigmoid, and the machine's own ceiling.
+//! - [`math`], [`quantised`], [`peak`]: exp and sigmoid, the rules of 8-bit tensors, and the machine's own ceiling.
 //!
 //! Without the default feature `std` the crate needs `core` alone.
 #![cfg_attr(not(any(test, feature = "std")), no_std)]
@@ -23,6 +23,7 @@ pub mod math;
 pub mod matmul;
 pub mod ops;
 pub mod peak;
+pub mod quantised;
 mod simd;
 #[cfg(test)]
 mod testing;

@@ -1,18 +1,28 @@
 //! One file per operation: its formula and the order of its sums, its specification, its vector body, its tests.
 
 pub mod conv;
+pub mod conv_i8;
 pub mod deconv3d;
 pub mod deform_conv2d;
 pub mod depthwise;
+pub mod depthwise_i8;
+pub mod dequantise;
 pub mod gate;
+pub mod gate_i8;
 pub mod gather;
+pub mod gather_i8;
 pub mod head;
 pub mod max_pool;
+pub mod max_pool_i8;
+pub mod mean_i8;
 pub mod normalise;
+pub mod normalise_i8;
 pub mod pool;
 pub mod project;
+pub mod quantise;
 pub mod scale_shift;
 pub mod upsample_add;
+pub mod upsample_add_i8;
 pub mod window_attention;
 pub mod winograd;
 
@@ -32,18 +42,28 @@ macro_rules! registry {
 #[cfg(feature = "cases")]
 registry! {
     conv
+    conv_i8
     deconv3d
     deform_conv2d
     depthwise
+    depthwise_i8
+    dequantise
     gate
+    gate_i8
     gather
+    gather_i8
     head
     max_pool
+    max_pool_i8
+    mean_i8
     normalise
+    normalise_i8
     pool
     project
+    quantise
     scale_shift
     upsample_add
+    upsample_add_i8
     window_attention
     winograd
 }

@@ -8,15 +8,20 @@
 //! A file per instruction set implements [`Simd`] for its token and says which register tile suits it.
 
 use crate::isa::Isa;
+use crate::quantised::lowest;
+use bytes::Form;
 use half::f16;
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx2;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx512;
+pub(crate) mod bytes;
 #[cfg(target_arch = "aarch64")]
 pub(crate) mod neon;
 pub(crate) mod scalar;
+#[cfg(test)]
+mod tests;
 
 /// Lanes of a vector on every instruction set, and columns of a packed weight panel.
 pub const LANES: usize = 16;
@@ -45,6 +50,10 @@ pub(crate) trait Simd: Copy {
     type V: Copy;
     /// Sixteen lanes of 32-bit integers.
     type I: Copy;
+    /// Sixteen lanes of 16-bit integers.
+    type H: Copy;
+    /// Sixteen lanes of 8-bit integers.
+    type B: Copy;
     /// Sixteen truth values.
     type M: Copy;
     /// The largest register tile: as many accumulators as fit beside the weights and a broadcast.
@@ -81,6 +90,27 @@ pub(crate) trait Simd: Copy {
         }
         sums
     }
+
+    /// Rows of the largest register tile of bytes; its panels are those of [`Simd::TILE`].
+    fn byte_rows(self) -> usize;
+    /// As [`Simd::rows`], for tiles of bytes.
+    fn rows_of_bytes<B: TileRows<Self>>(self, left: usize, body: B) -> usize;
+    /// Whether [`Simd::multiply_bytes`] reads signed left elements 128 too large, so that sums must start as much lower.
+    fn shifts_bytes(self) -> bool;
+    /// `sums[r][j] += left[r][k] * panels[j][k]` modulo 2^32, exact where the operands are of the form `form`. A panel has 16
+    /// columns of four weights for every four k.
+    ///
+    /// # Safety
+    /// Each pointer in `left` must be valid for reading `depth` bytes, a multiple of 4, each in `panels` for [`LANES`] times
+    /// as many.
+    unsafe fn multiply_bytes<const N: usize, const P: usize>(
+        self,
+        form: Form,
+        left: [*const i8; N],
+        panels: [*const i8; P],
+        depth: usize,
+        sums: [[Self::I; P]; N],
+    ) -> [[Self::I; P]; N];
 
     /// All lanes `x`.
     fn splat(self, x: f32) -> Self::V;
@@ -127,8 +157,55 @@ pub(crate) trait Simd: Copy {
     fn mul_int(self, a: Self::I, b: Self::I) -> Self::I;
     /// `a` where `mask` holds, else 0.
     fn keep(self, mask: Self::M, a: Self::I) -> Self::I;
-    /// Writes 16 integer lanes.
-    fn store_int(self, x: &mut [u32; LANES], v: Self::I);
+    /// Reads 16 integer lanes from `p`.
+    ///
+    /// # Safety
+    /// `p` must be valid for reading 16 consecutive i32; no alignment is needed.
+    unsafe fn load_int_ptr(self, p: *const i32) -> Self::I;
+    /// Writes 16 integer lanes to `p`.
+    ///
+    /// # Safety
+    /// `p` must be valid for writing 16 consecutive i32; no alignment is needed.
+    unsafe fn store_int_ptr(self, p: *mut i32, v: Self::I);
+    /// `a >> bits`, for `bits` below 32, with copies of the sign shifted in.
+    fn shift_right_signed(self, a: Self::I, bits: u32) -> Self::I;
+    /// The larger of signed integers.
+    fn max_int(self, a: Self::I, b: Self::I) -> Self::I;
+    /// The smaller of signed integers.
+    fn min_int(self, a: Self::I, b: Self::I) -> Self::I;
+    /// `a * b` for lanes from -2^15 up to 2^15 - 1; any integer for others. Fast where `b` is a loop's constant.
+    fn mul_short(self, a: Self::I, b: Self::I) -> Self::I;
+    /// [`crate::quantised::requantise`] of signed integers.
+    fn requantise(self, sum: Self::I, multiplier: Self::I) -> Self::I;
+    /// The nearest f32 to each signed integer, ties to even.
+    fn to_float(self, a: Self::I) -> Self::V;
+    /// The nearest integer, ties to even, for lanes from -2^31 up to 2^31 - 128; any integer for others.
+    fn nearest(self, a: Self::V) -> Self::I;
+
+    /// Reads 16 bytes from `p`.
+    ///
+    /// # Safety
+    /// `p` must be valid for reading 16 consecutive i8; no alignment is needed.
+    unsafe fn load_bytes_ptr(self, p: *const i8) -> Self::B;
+    /// Writes 16 bytes to `p`.
+    ///
+    /// # Safety
+    /// `p` must be valid for writing 16 consecutive i8; no alignment is needed.
+    unsafe fn store_bytes_ptr(self, p: *mut i8, v: Self::B);
+    /// All byte lanes `x`.
+    fn splat_bytes(self, x: i8) -> Self::B;
+    /// The larger of signed bytes.
+    fn max_bytes(self, a: Self::B, b: Self::B) -> Self::B;
+    /// Signed bytes as 32-bit integers.
+    fn bytes_to_int(self, a: Self::B) -> Self::I;
+    /// Signed bytes as 16-bit integers.
+    fn bytes_to_short(self, a: Self::B) -> Self::H;
+    /// `a + b` modulo 2^16.
+    fn add_short(self, a: Self::H, b: Self::H) -> Self::H;
+    /// Signed 16-bit integers as 32-bit integers.
+    fn short_to_int(self, a: Self::H) -> Self::I;
+    /// Signed integers clamped to -128..=127.
+    fn narrow(self, a: Self::I) -> Self::B;
     /// `a >= b` in every lane: false where either is NaN.
     fn at_least(self, a: Self::V, b: Self::V) -> Self::M;
     /// Where both hold.
@@ -173,6 +250,92 @@ pub(crate) trait Simd: Copy {
                 x.copy_from_slice(&lanes[..n]);
             }
         }
+    }
+    /// Reads 16 integer lanes.
+    #[inline(always)]
+    fn load_int(self, x: &[i32; LANES]) -> Self::I {
+        // SAFETY: the array holds exactly 16 i32.
+        unsafe { self.load_int_ptr(x.as_ptr()) }
+    }
+    /// Writes 16 integer lanes.
+    #[inline(always)]
+    fn store_int(self, x: &mut [u32; LANES], v: Self::I) {
+        // SAFETY: the array holds exactly 16 integers of 32 bits.
+        unsafe { self.store_int_ptr(x.as_mut_ptr().cast(), v) }
+    }
+    /// Reads the first integer lanes from up to 16 values; the others are 0.
+    #[inline(always)]
+    fn load_int_part(self, x: &[i32]) -> Self::I {
+        match x.first_chunk() {
+            Some(x) => self.load_int(x),
+            None => {
+                let mut lanes = [0; LANES];
+                lanes[..x.len()].copy_from_slice(x);
+                self.load_int(&lanes)
+            }
+        }
+    }
+    /// Writes the first integer lanes into up to 16 values.
+    #[inline(always)]
+    fn store_int_part(self, x: &mut [i32], v: Self::I) {
+        match x.first_chunk_mut::<LANES>() {
+            // SAFETY: the array holds exactly 16 i32.
+            Some(x) => unsafe { self.store_int_ptr(x.as_mut_ptr(), v) },
+            None => {
+                let n = x.len();
+                x.copy_from_slice(&self.int_lanes(v)[..n]);
+            }
+        }
+    }
+    /// The integer lanes as values.
+    #[inline(always)]
+    fn int_lanes(self, v: Self::I) -> [i32; LANES] {
+        let mut lanes = [0; LANES];
+        // SAFETY: the array holds exactly 16 i32.
+        unsafe { self.store_int_ptr(lanes.as_mut_ptr(), v) }
+        lanes
+    }
+    /// Reads 16 bytes.
+    #[inline(always)]
+    fn load_bytes(self, x: &[i8; LANES]) -> Self::B {
+        // SAFETY: the array holds exactly 16 i8.
+        unsafe { self.load_bytes_ptr(x.as_ptr()) }
+    }
+    /// Writes 16 bytes.
+    #[inline(always)]
+    fn store_bytes(self, x: &mut [i8; LANES], v: Self::B) {
+        // SAFETY: the array holds exactly 16 i8.
+        unsafe { self.store_bytes_ptr(x.as_mut_ptr(), v) }
+    }
+    /// Reads the first lanes from up to 16 bytes; the others are 0.
+    #[inline(always)]
+    fn load_bytes_part(self, x: &[i8]) -> Self::B {
+        match x.first_chunk() {
+            Some(x) => self.load_bytes(x),
+            None => {
+                let mut lanes = [0; LANES];
+                lanes[..x.len()].copy_from_slice(x);
+                self.load_bytes(&lanes)
+            }
+        }
+    }
+    /// Writes the first lanes into up to 16 bytes.
+    #[inline(always)]
+    fn store_bytes_part(self, x: &mut [i8], v: Self::B) {
+        match x.first_chunk_mut() {
+            Some(x) => self.store_bytes(x, v),
+            None => {
+                let mut lanes = [0; LANES];
+                self.store_bytes(&mut lanes, v);
+                let n = x.len();
+                x.copy_from_slice(&lanes[..n]);
+            }
+        }
+    }
+    /// [`crate::quantised::clamp`] of signed integers.
+    #[inline(always)]
+    fn quantised(self, a: Self::I, relu: bool) -> Self::B {
+        self.max_bytes(self.narrow(a), self.splat_bytes(lowest(relu)))
     }
     /// `if x < 0 { 0 } else { x }`: NaN and -0 pass.
     #[inline(always)]

@@ -13,6 +13,7 @@ mod builder;
 mod call;
 mod element;
 mod head;
+mod hidden;
 mod matrices;
 mod neck;
 mod operation;
@@ -21,6 +22,7 @@ mod options;
 pub mod parts;
 mod recipe;
 mod rewrite;
+pub mod scale;
 mod site;
 mod tensor;
 #[cfg(test)]
@@ -30,10 +32,12 @@ pub mod weights;
 
 pub use call::{Added, Call, MAX_INPUTS, MAX_OUTPUTS, Moment, Tile};
 pub use element::{Element, Elements, Scalar};
+pub use hidden::hidden_layers;
 pub use matrices::{Csr, Level, Matrix};
 pub use operation::{Graph, Operation};
 pub use ops::Op;
 pub use options::{Results, Rewrites};
 pub use recipe::{ConvNames, Recipe};
+pub use scale::Scale;
 pub use site::{Residual, Site};
 pub use tensor::{Branch, Lifetime, Scope, Section, Space, Tensor, TensorId};

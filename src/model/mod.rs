@@ -6,6 +6,7 @@
 #[cfg(feature = "import")]
 pub mod checkpoint;
 pub mod import;
+pub mod ranges;
 pub mod seeded;
 pub mod selftest;
 

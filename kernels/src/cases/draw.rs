@@ -105,6 +105,57 @@ impl Draw {
         (0..n).map(|_| self.value()).collect()
     }
 
+    /// A byte: one in four is taken from the bytes as it is, as long as there are any.
+    pub fn int8(&mut self) -> i8 {
+        let bits = self.bits();
+        if bits.is_multiple_of(4) && self.bytes.len() > 0 {
+            return self.byte().cast_signed();
+        }
+        match self.mode {
+            0 => (bits >> 32) as i8,
+            1 => [-128, -127, 127, 0][(bits >> 32) as usize % 4],
+            2 => (bits >> 32) as i8 % 8,
+            _ => ((bits >> 32) as i8).max(0),
+        }
+    }
+
+    /// `n` bytes.
+    pub fn int8s(&mut self, n: usize) -> Vec<i8> {
+        (0..n).map(|_| self.int8()).collect()
+    }
+
+    /// An integer of any size: one in four is taken from the bytes as it is, as long as there are any.
+    pub fn int32(&mut self) -> i32 {
+        let bits = self.bits();
+        if bits.is_multiple_of(4) && self.bytes.len() >= 4 {
+            return i32::from_le_bytes([self.byte(), self.byte(), self.byte(), self.byte()]);
+        }
+        match (self.mode, bits >> 8 & 7) {
+            (1, 0) => i32::MAX,
+            (1, 1) => i32::MIN,
+            // Any number of leading zeros or ones.
+            _ => (bits >> 32) as i32 >> (bits >> 16 & 31),
+        }
+    }
+
+    /// An integer from `low` to `high`, both included.
+    pub fn int_within(&mut self, low: i32, high: i32) -> i32 {
+        let x = self.int32();
+        if (low..=high).contains(&x) {
+            return x;
+        }
+        match x & 7 {
+            0 => low,
+            1 => high,
+            _ => (i64::from(low) + i64::from(x).rem_euclid(i64::from(high) - i64::from(low) + 1)) as i32,
+        }
+    }
+
+    /// `n` integers from `low` to `high`, both included.
+    pub fn ints_within(&mut self, n: usize, low: i32, high: i32) -> Vec<i32> {
+        (0..n).map(|_| self.int_within(low, high)).collect()
+    }
+
     /// `n` values, if the flag that comes first says so.
     pub fn maybe(&mut self, n: usize) -> Option<Vec<f32>> {
         self.flag().then(|| self.values(n))

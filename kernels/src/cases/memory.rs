@@ -46,6 +46,8 @@ impl Memory {
 pub trait Plain: Copy {}
 impl Plain for bool {}
 impl Plain for u8 {}
+impl Plain for i8 {}
+impl Plain for i32 {}
 impl Plain for u32 {}
 impl Plain for f16 {}
 impl Plain for f32 {}

@@ -1,5 +1,6 @@
 //! AVX2 + FMA + F16C: a vector is a pair of 8-lane registers.
 
+use super::bytes::{self, Form};
 use super::{Kernel, LANES, Simd, Tile, TileRows};
 use crate::isa::Avx2;
 use core::arch::x86_64::*;
@@ -26,6 +27,8 @@ impl Simd for Avx2 {
     type V = [__m256; 2];
     type I = [__m256i; 2];
     type M = [__m256; 2];
+    type H = __m256i;
+    type B = __m128i;
     // 12 accumulators of 8 lanes, 2 registers of weights and broadcasts, the most that 16 registers hold.
     const TILE: Tile = Tile { rows: 6, panels: 1 };
     const MASKED: bool = false;
@@ -41,6 +44,31 @@ impl Simd for Avx2 {
             _ => body.run::<1>(self),
         }
         left.min(6)
+    }
+
+    #[inline(always)]
+    fn byte_rows(self) -> usize {
+        bytes::avx2::tile_rows(self)
+    }
+    #[inline(always)]
+    fn rows_of_bytes<B: TileRows<Self>>(self, left: usize, body: B) -> usize {
+        bytes::avx2::rows(self, left, body)
+    }
+    #[inline(always)]
+    fn shifts_bytes(self) -> bool {
+        self.vnni().is_some()
+    }
+    #[inline(always)]
+    unsafe fn multiply_bytes<const N: usize, const P: usize>(
+        self,
+        form: Form,
+        left: [*const i8; N],
+        panels: [*const i8; P],
+        depth: usize,
+        sums: [[Self::I; P]; N],
+    ) -> [[Self::I; P]; N] {
+        // SAFETY: the caller's promise is passed on.
+        unsafe { bytes::avx2::multiply(self, form, left, panels, depth, sums) }
     }
 
     #[inline(always)]
@@ -136,12 +164,109 @@ impl Simd for Avx2 {
         unsafe { [0, 1].map(|i| _mm256_and_si256(_mm256_castps_si256(mask[i]), a[i])) }
     }
     #[inline(always)]
-    fn store_int(self, x: &mut [u32; LANES], v: Self::I) {
-        let p = x.as_mut_ptr().cast::<__m256i>();
-        // SAFETY: the array holds two times 32 bytes, written unaligned; the token proves AVX2.
+    unsafe fn load_int_ptr(self, p: *const i32) -> Self::I {
+        // SAFETY: the caller promises 16 readable i32 at `p`; the token proves AVX2.
+        unsafe { [_mm256_loadu_si256(p.cast()), _mm256_loadu_si256(p.add(8).cast())] }
+    }
+    #[inline(always)]
+    unsafe fn store_int_ptr(self, p: *mut i32, v: Self::I) {
+        // SAFETY: the caller promises 16 writable i32 at `p`; the token proves AVX2.
         unsafe {
-            _mm256_storeu_si256(p, v[0]);
-            _mm256_storeu_si256(p.add(1), v[1]);
+            _mm256_storeu_si256(p.cast(), v[0]);
+            _mm256_storeu_si256(p.add(8).cast(), v[1]);
+        }
+    }
+    #[inline(always)]
+    fn shift_right_signed(self, a: Self::I, bits: u32) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        a.map(|a| unsafe { _mm256_sra_epi32(a, _mm_cvtsi32_si128(bits.cast_signed())) })
+    }
+    #[inline(always)]
+    fn max_int(self, a: Self::I, b: Self::I) -> Self::I {
+        halves!(_mm256_max_epi32(a, b))
+    }
+    #[inline(always)]
+    fn min_int(self, a: Self::I, b: Self::I) -> Self::I {
+        halves!(_mm256_min_epi32(a, b))
+    }
+    #[inline(always)]
+    fn mul_short(self, a: Self::I, b: Self::I) -> Self::I {
+        // A sum of two products, of the halves of a lane. Without the sign in `b`'s upper half the second is 0.
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        unsafe { [0, 1].map(|i| _mm256_madd_epi16(a[i], _mm256_and_si256(b[i], _mm256_set1_epi32(0xffff)))) }
+    }
+    #[inline(always)]
+    fn requantise(self, sum: Self::I, multiplier: Self::I) -> Self::I {
+        // Products of 64 bits of the even lanes, and of the odd ones.
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        unsafe {
+            let half = _mm256_set1_epi64x(1 << 31);
+            [0, 1].map(|i| {
+                let odd = |x| _mm256_srli_epi64::<32>(x);
+                let even_product = _mm256_add_epi64(_mm256_mul_epi32(sum[i], multiplier[i]), half);
+                let odd_product = _mm256_add_epi64(_mm256_mul_epi32(odd(sum[i]), odd(multiplier[i])), half);
+                _mm256_blend_epi32::<0b1010_1010>(odd(even_product), odd_product)
+            })
+        }
+    }
+    #[inline(always)]
+    fn to_float(self, a: Self::I) -> Self::V {
+        halves!(_mm256_cvtepi32_ps(a))
+    }
+    #[inline(always)]
+    fn nearest(self, a: Self::V) -> Self::I {
+        halves!(_mm256_cvtps_epi32(a))
+    }
+    #[inline(always)]
+    unsafe fn load_bytes_ptr(self, p: *const i8) -> Self::B {
+        // SAFETY: the caller promises 16 readable bytes at `p`; x86-64 always has SSE2.
+        unsafe { _mm_loadu_si128(p.cast()) }
+    }
+    #[inline(always)]
+    unsafe fn store_bytes_ptr(self, p: *mut i8, v: Self::B) {
+        // SAFETY: the caller promises 16 writable bytes at `p`; x86-64 always has SSE2.
+        unsafe { _mm_storeu_si128(p.cast(), v) }
+    }
+    #[inline(always)]
+    fn splat_bytes(self, x: i8) -> Self::B {
+        // SAFETY: x86-64 always has SSE2.
+        unsafe { _mm_set1_epi8(x) }
+    }
+    #[inline(always)]
+    fn max_bytes(self, a: Self::B, b: Self::B) -> Self::B {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        unsafe { _mm_max_epi8(a, b) }
+    }
+    #[inline(always)]
+    fn bytes_to_int(self, a: Self::B) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        unsafe { [_mm256_cvtepi8_epi32(a), _mm256_cvtepi8_epi32(_mm_unpackhi_epi64(a, a))] }
+    }
+    #[inline(always)]
+    fn bytes_to_short(self, a: Self::B) -> Self::H {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        unsafe { _mm256_cvtepi8_epi16(a) }
+    }
+    #[inline(always)]
+    fn add_short(self, a: Self::H, b: Self::H) -> Self::H {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        unsafe { _mm256_add_epi16(a, b) }
+    }
+    #[inline(always)]
+    fn short_to_int(self, a: Self::H) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        unsafe {
+            let halves = [_mm256_castsi256_si128(a), _mm256_extracti128_si256::<1>(a)];
+            halves.map(|half| _mm256_cvtepi16_epi32(half))
+        }
+    }
+    #[inline(always)]
+    fn narrow(self, a: Self::I) -> Self::B {
+        // SAFETY: the token `self` proves that the CPU has AVX2.
+        unsafe {
+            // Each 128 bits are packed by themselves: the quarters lie as 0, 2, 1, 3.
+            let short = _mm256_permute4x64_epi64::<0b11_01_10_00>(_mm256_packs_epi32(a[0], a[1]));
+            _mm_packs_epi16(_mm256_castsi256_si128(short), _mm256_extracti128_si256::<1>(short))
         }
     }
     #[inline(always)]

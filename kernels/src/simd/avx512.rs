@@ -1,5 +1,6 @@
 //! AVX-512 F, VL, DQ and BW: a vector is one 16-lane register, and a part of one is a mask.
 
+use super::bytes::{self, Form};
 use super::{Kernel, LANES, Simd, Tile, TileRows};
 use crate::isa::Avx512;
 use core::arch::x86_64::*;
@@ -23,7 +24,7 @@ fn first(n: usize) -> __mmask16 {
 /// Calls a lane-wise intrinsic.
 macro_rules! lanewise {
     ($($op:tt)*) => {
-        // SAFETY: the token `self` proves that the CPU has AVX-512 F.
+        // SAFETY: the token `self` proves that the CPU has AVX-512 F, VL, DQ and BW.
         unsafe { $($op)* }
     };
 }
@@ -32,6 +33,8 @@ impl Simd for Avx512 {
     type V = __m512;
     type I = __m512i;
     type M = __mmask16;
+    type H = __m256i;
+    type B = __m128i;
     // 24 accumulators and 2 registers of weights in 32 registers; each broadcast serves two multiply-adds, so that loads do
     // not limit the speed.
     const TILE: Tile = Tile { rows: 12, panels: 2 };
@@ -45,6 +48,31 @@ impl Simd for Avx512 {
             3.. => (body.run::<3>(self), 3).1,
             _ => (body.run::<1>(self), 1).1,
         }
+    }
+
+    #[inline(always)]
+    fn byte_rows(self) -> usize {
+        bytes::avx512::TILE_ROWS
+    }
+    #[inline(always)]
+    fn rows_of_bytes<B: TileRows<Self>>(self, left: usize, body: B) -> usize {
+        bytes::avx512::rows(self, left, body)
+    }
+    #[inline(always)]
+    fn shifts_bytes(self) -> bool {
+        self.vnni().is_some()
+    }
+    #[inline(always)]
+    unsafe fn multiply_bytes<const N: usize, const P: usize>(
+        self,
+        form: Form,
+        left: [*const i8; N],
+        panels: [*const i8; P],
+        depth: usize,
+        sums: [[Self::I; P]; N],
+    ) -> [[Self::I; P]; N] {
+        // SAFETY: the caller's promise is passed on.
+        unsafe { bytes::avx512::multiply(self, form, left, panels, depth, sums) }
     }
 
     #[inline(always)]
@@ -131,9 +159,88 @@ impl Simd for Avx512 {
         lanewise!(_mm512_maskz_mov_epi32(mask, a))
     }
     #[inline(always)]
-    fn store_int(self, x: &mut [u32; LANES], v: Self::I) {
-        // SAFETY: the array is 64 bytes, written unaligned; the token proves AVX-512 F.
-        unsafe { _mm512_storeu_si512(x.as_mut_ptr().cast(), v) }
+    unsafe fn load_int_ptr(self, p: *const i32) -> Self::I {
+        // SAFETY: the caller promises 16 readable i32 at `p`; the token proves AVX-512 F.
+        unsafe { _mm512_loadu_si512(p.cast()) }
+    }
+    #[inline(always)]
+    unsafe fn store_int_ptr(self, p: *mut i32, v: Self::I) {
+        // SAFETY: the caller promises 16 writable i32 at `p`; the token proves AVX-512 F.
+        unsafe { _mm512_storeu_si512(p.cast(), v) }
+    }
+    #[inline(always)]
+    fn shift_right_signed(self, a: Self::I, bits: u32) -> Self::I {
+        lanewise!(_mm512_sra_epi32(a, _mm_cvtsi32_si128(bits.cast_signed())))
+    }
+    #[inline(always)]
+    fn max_int(self, a: Self::I, b: Self::I) -> Self::I {
+        lanewise!(_mm512_max_epi32(a, b))
+    }
+    #[inline(always)]
+    fn min_int(self, a: Self::I, b: Self::I) -> Self::I {
+        lanewise!(_mm512_min_epi32(a, b))
+    }
+    #[inline(always)]
+    fn mul_short(self, a: Self::I, b: Self::I) -> Self::I {
+        // A sum of two products, of the halves of a lane. Without the sign in `b`'s upper half the second is 0.
+        lanewise!(_mm512_madd_epi16(a, _mm512_and_si512(b, _mm512_set1_epi32(0xffff))))
+    }
+    #[inline(always)]
+    fn requantise(self, sum: Self::I, multiplier: Self::I) -> Self::I {
+        // Products of 64 bits of the even lanes, and of the odd ones.
+        lanewise!({
+            let half = _mm512_set1_epi64(1 << 31);
+            let odd = |x| _mm512_srli_epi64::<32>(x);
+            let even_product = _mm512_add_epi64(_mm512_mul_epi32(sum, multiplier), half);
+            let odd_product = _mm512_add_epi64(_mm512_mul_epi32(odd(sum), odd(multiplier)), half);
+            _mm512_mask_blend_epi32(0b1010_1010_1010_1010, odd(even_product), odd_product)
+        })
+    }
+    #[inline(always)]
+    fn to_float(self, a: Self::I) -> Self::V {
+        lanewise!(_mm512_cvtepi32_ps(a))
+    }
+    #[inline(always)]
+    fn nearest(self, a: Self::V) -> Self::I {
+        lanewise!(_mm512_cvtps_epi32(a))
+    }
+    #[inline(always)]
+    unsafe fn load_bytes_ptr(self, p: *const i8) -> Self::B {
+        // SAFETY: the caller promises 16 readable bytes at `p`; x86-64 always has SSE2.
+        unsafe { _mm_loadu_si128(p.cast()) }
+    }
+    #[inline(always)]
+    unsafe fn store_bytes_ptr(self, p: *mut i8, v: Self::B) {
+        // SAFETY: the caller promises 16 writable bytes at `p`; x86-64 always has SSE2.
+        unsafe { _mm_storeu_si128(p.cast(), v) }
+    }
+    #[inline(always)]
+    fn splat_bytes(self, x: i8) -> Self::B {
+        lanewise!(_mm_set1_epi8(x))
+    }
+    #[inline(always)]
+    fn max_bytes(self, a: Self::B, b: Self::B) -> Self::B {
+        lanewise!(_mm_max_epi8(a, b))
+    }
+    #[inline(always)]
+    fn bytes_to_int(self, a: Self::B) -> Self::I {
+        lanewise!(_mm512_cvtepi8_epi32(a))
+    }
+    #[inline(always)]
+    fn bytes_to_short(self, a: Self::B) -> Self::H {
+        lanewise!(_mm256_cvtepi8_epi16(a))
+    }
+    #[inline(always)]
+    fn add_short(self, a: Self::H, b: Self::H) -> Self::H {
+        lanewise!(_mm256_add_epi16(a, b))
+    }
+    #[inline(always)]
+    fn short_to_int(self, a: Self::H) -> Self::I {
+        lanewise!(_mm512_cvtepi16_epi32(a))
+    }
+    #[inline(always)]
+    fn narrow(self, a: Self::I) -> Self::B {
+        lanewise!(_mm512_cvtsepi32_epi8(a))
     }
     #[inline(always)]
     fn at_least(self, a: Self::V, b: Self::V) -> Self::M {
@@ -158,5 +265,25 @@ impl Simd for Avx512 {
     fn store_part(self, x: &mut [f32], v: Self::V) {
         // SAFETY: lanes beyond the slice are masked, and masked lanes are not written; the token proves AVX-512 F.
         unsafe { _mm512_mask_storeu_ps(x.as_mut_ptr(), first(x.len()), v) }
+    }
+    #[inline(always)]
+    fn load_bytes_part(self, x: &[i8]) -> Self::B {
+        // SAFETY: lanes beyond the slice are masked, and masked lanes are not read; the token proves AVX-512 BW and VL.
+        unsafe { _mm_maskz_loadu_epi8(first(x.len()), x.as_ptr()) }
+    }
+    #[inline(always)]
+    fn store_bytes_part(self, x: &mut [i8], v: Self::B) {
+        // SAFETY: lanes beyond the slice are masked, and masked lanes are not written; the token proves AVX-512 BW and VL.
+        unsafe { _mm_mask_storeu_epi8(x.as_mut_ptr(), first(x.len()), v) }
+    }
+    #[inline(always)]
+    fn store_int_part(self, x: &mut [i32], v: Self::I) {
+        // SAFETY: lanes beyond the slice are masked, and masked lanes are not written; the token proves AVX-512 F.
+        unsafe { _mm512_mask_storeu_epi32(x.as_mut_ptr(), first(x.len()), v) }
+    }
+    #[inline(always)]
+    fn load_int_part(self, x: &[i32]) -> Self::I {
+        // SAFETY: lanes beyond the slice are masked, and masked lanes are not read; the token proves AVX-512 F.
+        unsafe { _mm512_maskz_loadu_epi32(first(x.len()), x.as_ptr()) }
     }
 }

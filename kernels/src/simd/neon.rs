@@ -2,6 +2,7 @@
 //!
 //! Where an instruction has no intrinsic in the oldest compiler that this crate supports, it is written as assembly.
 
+use super::bytes::{self, Form};
 use super::{Kernel, LANES, Simd, Tile, TileRows};
 use crate::isa::Neon;
 use core::arch::aarch64::*;
@@ -36,10 +37,32 @@ macro_rules! select {
     }};
 }
 
+/// The same bits as signed integers.
+///
+/// # Safety
+/// The CPU must have NEON.
+#[inline(always)]
+unsafe fn signed(a: [uint32x4_t; 4]) -> [int32x4_t; 4] {
+    // SAFETY: the caller promises NEON.
+    a.map(|a| unsafe { vreinterpretq_s32_u32(a) })
+}
+
+/// The same bits as unsigned integers.
+///
+/// # Safety
+/// The CPU must have NEON.
+#[inline(always)]
+unsafe fn unsigned(a: [int32x4_t; 4]) -> [uint32x4_t; 4] {
+    // SAFETY: the caller promises NEON.
+    a.map(|a| unsafe { vreinterpretq_u32_s32(a) })
+}
+
 impl Simd for Neon {
     type V = [float32x4_t; 4];
     type I = [uint32x4_t; 4];
     type M = [uint32x4_t; 4];
+    type H = [int16x8_t; 2];
+    type B = int8x16_t;
     // 24 accumulators of 4 lanes, a register of four k of each row, and 2 of weights fill the 32 registers.
     const TILE: Tile = Tile { rows: 6, panels: 1 };
     const MASKED: bool = false;
@@ -96,6 +119,31 @@ impl Simd for Neon {
             }
         }
         sums
+    }
+
+    #[inline(always)]
+    fn byte_rows(self) -> usize {
+        bytes::neon::tile_rows(self)
+    }
+    #[inline(always)]
+    fn rows_of_bytes<B: TileRows<Self>>(self, left: usize, body: B) -> usize {
+        bytes::neon::rows(self, left, body)
+    }
+    #[inline(always)]
+    fn shifts_bytes(self) -> bool {
+        false
+    }
+    #[inline(always)]
+    unsafe fn multiply_bytes<const N: usize, const P: usize>(
+        self,
+        form: Form,
+        left: [*const i8; N],
+        panels: [*const i8; P],
+        depth: usize,
+        sums: [[Self::I; P]; N],
+    ) -> [[Self::I; P]; N] {
+        // SAFETY: the caller's promise is passed on.
+        unsafe { bytes::neon::multiply(self, form, left, panels, depth, sums) }
     }
 
     #[inline(always)]
@@ -200,10 +248,113 @@ impl Simd for Neon {
         quarters!(vandq_u32(mask, a))
     }
     #[inline(always)]
-    fn store_int(self, x: &mut [u32; LANES], v: Self::I) {
-        for (x, v) in x.as_chunks_mut::<QUARTER>().0.iter_mut().zip(v) {
-            // SAFETY: the chunk holds the 4 lanes; the token proves NEON.
-            unsafe { vst1q_u32(x.as_mut_ptr(), v) }
+    unsafe fn load_int_ptr(self, p: *const i32) -> Self::I {
+        // SAFETY: the caller promises 16 readable integers at `p`; the token proves NEON.
+        unsafe { [0, 1, 2, 3].map(|q| vld1q_u32(p.add(q * QUARTER).cast())) }
+    }
+    #[inline(always)]
+    unsafe fn store_int_ptr(self, p: *mut i32, v: Self::I) {
+        for q in 0..4 {
+            // SAFETY: the caller promises 16 writable integers at `p`; the token proves NEON.
+            unsafe { vst1q_u32(p.add(q * QUARTER).cast(), v[q]) }
+        }
+    }
+    #[inline(always)]
+    fn shift_right_signed(self, a: Self::I, bits: u32) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has NEON, whose left shift by a negative number is one to the right.
+        unsafe { unsigned(signed(a).map(|a| vshlq_s32(a, vdupq_n_s32(-bits.cast_signed())))) }
+    }
+    #[inline(always)]
+    fn max_int(self, a: Self::I, b: Self::I) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe {
+            let (a, b) = (signed(a), signed(b));
+            unsigned(quarters!(vmaxq_s32(a, b)))
+        }
+    }
+    #[inline(always)]
+    fn min_int(self, a: Self::I, b: Self::I) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe {
+            let (a, b) = (signed(a), signed(b));
+            unsigned(quarters!(vminq_s32(a, b)))
+        }
+    }
+    #[inline(always)]
+    fn mul_short(self, a: Self::I, b: Self::I) -> Self::I {
+        self.mul_int(a, b)
+    }
+    #[inline(always)]
+    fn requantise(self, sum: Self::I, multiplier: Self::I) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe {
+            let (sum, multiplier) = (signed(sum), signed(multiplier));
+            unsigned([0, 1, 2, 3].map(|q| {
+                let low = vmull_s32(vget_low_s32(sum[q]), vget_low_s32(multiplier[q]));
+                let high = vmull_high_s32(sum[q], multiplier[q]);
+                vrshrn_high_n_s64::<32>(vrshrn_n_s64::<32>(low), high)
+            }))
+        }
+    }
+    #[inline(always)]
+    fn to_float(self, a: Self::I) -> Self::V {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe { signed(a).map(|a| vcvtq_f32_s32(a)) }
+    }
+    #[inline(always)]
+    fn nearest(self, a: Self::V) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe { unsigned(quarters!(vcvtnq_s32_f32(a))) }
+    }
+    #[inline(always)]
+    unsafe fn load_bytes_ptr(self, p: *const i8) -> Self::B {
+        // SAFETY: the caller promises 16 readable bytes at `p`; the token proves NEON.
+        unsafe { vld1q_s8(p) }
+    }
+    #[inline(always)]
+    unsafe fn store_bytes_ptr(self, p: *mut i8, v: Self::B) {
+        // SAFETY: the caller promises 16 writable bytes at `p`; the token proves NEON.
+        unsafe { vst1q_s8(p, v) }
+    }
+    #[inline(always)]
+    fn splat_bytes(self, x: i8) -> Self::B {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe { vdupq_n_s8(x) }
+    }
+    #[inline(always)]
+    fn max_bytes(self, a: Self::B, b: Self::B) -> Self::B {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe { vmaxq_s8(a, b) }
+    }
+    #[inline(always)]
+    fn bytes_to_int(self, a: Self::B) -> Self::I {
+        self.short_to_int(self.bytes_to_short(a))
+    }
+    #[inline(always)]
+    fn bytes_to_short(self, a: Self::B) -> Self::H {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe { [vmovl_s8(vget_low_s8(a)), vmovl_high_s8(a)] }
+    }
+    #[inline(always)]
+    fn add_short(self, a: Self::H, b: Self::H) -> Self::H {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe { [vaddq_s16(a[0], b[0]), vaddq_s16(a[1], b[1])] }
+    }
+    #[inline(always)]
+    fn short_to_int(self, a: Self::H) -> Self::I {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe {
+            let low = |a| vmovl_s16(vget_low_s16(a));
+            unsigned([low(a[0]), vmovl_high_s16(a[0]), low(a[1]), vmovl_high_s16(a[1])])
+        }
+    }
+    #[inline(always)]
+    fn narrow(self, a: Self::I) -> Self::B {
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        unsafe {
+            let a = signed(a);
+            let halves = [0, 2].map(|q| vqmovn_high_s32(vqmovn_s32(a[q]), a[q + 1]));
+            vqmovn_high_s16(vqmovn_s16(halves[0]), halves[1])
         }
     }
     #[inline(always)]

@@ -54,7 +54,7 @@ impl Case for Call {
         };
         let kept = self.logits.then_some(&mut logits[..]);
         head(isa, &args, self.rows.clone(), &mut classes, kept, &mut scratch);
-        Output { values: logits.to_vec(), codes: classes.iter().map(|class| u32::from(*class)).collect() }
+        Output { values: logits.to_vec(), codes: classes.iter().map(|class| i64::from(*class)).collect() }
     }
 }
 

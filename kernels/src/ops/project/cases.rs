@@ -37,7 +37,7 @@ impl Case for Call {
         let [xs, ys, zs] = self.axes.each_ref().map(|axis| memory.hold(axis));
         let mut out = memory.filled(xs.len() * ys.len() * zs.len(), 7u32);
         let any = project_points(isa, &self.projection, &xs, &ys, &zs, &mut out);
-        let codes = out.iter().copied().chain([u32::from(any)]).collect();
+        let codes = out.iter().copied().chain([u32::from(any)]).map(i64::from).collect();
         Output { values: Vec::new(), codes }
     }
 }
