@@ -7,8 +7,8 @@ use super::element::Element;
 use super::hidden::hidden_layers;
 use super::operation::{Graph, Operation};
 use super::ops::{
-    BroadcastI8, ConvI8, DeconvI8, DeformConvI8, DepthwiseI8, Dequantise, GateI8, GatherI8, GlobalMeanI8, HeadI8,
-    MaxPoolI8, NormaliseI8, Op, Quantise, UpsampleAddI8,
+    BroadcastI8, ConvI8, DepthwiseI8, Dequantise, GateI8, GatherI8, GlobalMeanI8, MaxPoolI8, NormaliseI8, Op, Quantise,
+    UpsampleAddI8,
 };
 use super::recipe::Recipe;
 use super::scale::Scale;
@@ -18,7 +18,7 @@ use std::collections::BTreeMap;
 use voxcast_kernels::conv::Geometry;
 
 /// Channels of tensors that integer products read come in multiples of this.
-pub const CHANNEL_GROUP: usize = 4;
+const CHANNEL_GROUP: usize = 4;
 
 /// What makes a folded graph one of 8-bit integers.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -59,9 +59,8 @@ impl Graph {
         let kept = self.kept(keep_f32)?;
         let scaled = self.scaled_as();
         for (index, &kept) in kept.iter().enumerate() {
-            let operation = &self.operations[index];
-            let output = operation.output();
-            if kept || matches!(operation.op, Op::Head(_)) {
+            let output = self.operations[index].output();
+            if kept || matches!(self.operations[index].op, Op::Head(_)) {
                 continue;
             }
             if self.is_offsets(index) {
@@ -69,14 +68,15 @@ impl Graph {
                 continue;
             }
             if self.tensors[output.0].element != Element::I8 {
-                let step = scale(&self.tensor(scaled[output.0]).name)?;
+                let step = self.coarse_enough(index, &scaled, scale)?;
                 let tensor = &mut self.tensors[output.0];
                 (tensor.element, tensor.scale) = (Element::I8, Some(step));
             }
         }
+        let signed = self.signed();
         for (index, &kept) in kept.iter().enumerate() {
             if !kept {
-                self.operations[index].op = self.in_integers(&self.operations[index], scale)?;
+                self.operations[index].op = self.in_integers(&self.operations[index], &signed, scale)?;
             }
         }
         // The image's fourth channel.
@@ -94,7 +94,9 @@ impl Graph {
             operation.name.strip_prefix(name).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
         };
         if let Some(name) = names.iter().find(|name| !self.operations.iter().any(|o| named(o, name))) {
-            let message = format!("no operation \"{name}\" to be kept in f32, expected one that inspect --operations lists, or its start");
+            let message = format!(
+                "no operation \"{name}\" to be kept in f32, expected one that inspect --operations lists, or its start"
+            );
             return Err(Error::new(ErrorKind::Unsupported, message));
         }
         if let Some(norm) = self.operations.iter().find(|o| matches!(o.op, Op::BatchNorm(_))) {
@@ -108,7 +110,8 @@ impl Graph {
             let odd = product(&operation.op)
                 && !on_image(operation)
                 && !self.tensor(operation.inputs[0]).channels.is_multiple_of(CHANNEL_GROUP);
-            let attention = matches!(operation.op, Op::WindowAttention(_));
+            let attention =
+                matches!(operation.op, Op::WindowAttention(_) | Op::Deconv(_) | Op::Head(_) | Op::DeformConv(_));
             kept.push(attention || odd || names.iter().any(|name| named(operation, name)));
         }
         let writers = self.writers();
@@ -179,31 +182,77 @@ impl Graph {
         scaled
     }
 
-    /// What computes `operation` in integers.
-    fn in_integers(&self, operation: &Operation, scale: &mut dyn FnMut(&str) -> Result<Scale>) -> Result<Op> {
+    /// The scale of what operation `index` writes: the tensor's, made coarser where the operation cannot write so fine a
+    /// one, beside the scale of what it reads.
+    fn coarse_enough(
+        &self,
+        index: usize,
+        scaled: &[TensorId],
+        scale: &mut dyn FnMut(&str) -> Result<Scale>,
+    ) -> Result<Scale> {
+        let operation = &self.operations[index];
+        let mut of = |id: TensorId| match self.tensor(id).scale {
+            Some(scale) => Ok(scale),
+            None => scale(&self.tensor(scaled[id.0]).name),
+        };
+        let mut step = of(scaled[operation.output().0])?;
+        let ratio = match operation.op {
+            Op::Normalise(_) => {
+                let least = Scale::try_from(NormaliseI8::LEAST_STEP)?;
+                return Ok(if step < least { least } else { step });
+            }
+            Op::UpsampleAdd(_) => UpsampleAddI8::MOST_RATIO,
+            Op::Gather(_) => GatherI8::MOST_RATIO,
+            Op::Gate(_) => GateI8::MOST_RATIO,
+            Op::GlobalMean(_) => GlobalMeanI8::MOST_RATIO,
+            _ => return Ok(step),
+        };
+        for &input in &operation.inputs {
+            let least = Scale::try_from((of(input)?.wide() / ratio) as f32)?;
+            step = if step < least { least } else { step };
+        }
+        Ok(step)
+    }
+
+    /// For each tensor, whether it may hold negative numbers.
+    fn signed(&self) -> Vec<bool> {
+        let mut signed = vec![false; self.tensors.len()];
+        for operation in &self.operations {
+            let read = operation.inputs.iter().any(|id| signed[id.0]);
+            let may = match (&operation.op, operation.residual) {
+                (Op::MaxPool(_) | Op::GlobalMean(_) | Op::Broadcast(_) | Op::UpsampleAdd(_) | Op::Gate(_), _) => read,
+                (_, Some(residual)) if residual.after => !operation.relu || signed[residual.tensor.0],
+                _ => !operation.relu,
+            };
+            signed[operation.output().0] |= may;
+        }
+        signed
+    }
+
+    /// What computes `operation` in integers. `signed` says which tensors may hold negative numbers.
+    fn in_integers(
+        &self,
+        operation: &Operation,
+        signed: &[bool],
+        scale: &mut dyn FnMut(&str) -> Result<Scale>,
+    ) -> Result<Op> {
+        let signed = operation.inputs.first().is_some_and(|x| signed[x.0]);
         Ok(match operation.op.clone() {
             Op::Normalise(_) => NormaliseI8.into(),
             Op::Conv(conv) => {
-                let channels = conv.geometry.channels.next_multiple_of(CHANNEL_GROUP);
-                ConvI8 { geometry: Geometry { channels, ..conv.geometry } }.into()
+                let inputs = conv.geometry.channels;
+                let geometry = Geometry { channels: inputs.next_multiple_of(CHANNEL_GROUP), ..conv.geometry };
+                ConvI8 { geometry, signed, inputs }.into()
             }
-            Op::DeformConv(conv) => DeformConvI8 { geometry: conv.geometry }.into(),
             Op::Depthwise(depthwise) => DepthwiseI8 { side: depthwise.side }.into(),
-            Op::MaxPool(pool) => {
-                MaxPoolI8 { side: pool.side, stride: pool.stride, padding: pool.padding }.into()
-            }
+            Op::MaxPool(pool) => MaxPoolI8 { side: pool.side, stride: pool.stride, padding: pool.padding }.into(),
             Op::UpsampleAdd(_) => UpsampleAddI8.into(),
             Op::Gather(gather) => {
                 GatherI8 { level: gather.level, matrix: gather.matrix, first_channel: gather.first_channel }.into()
             }
-            Op::Deconv(_) => DeconvI8.into(),
             Op::Gate(_) => GateI8.into(),
             Op::GlobalMean(_) => GlobalMeanI8.into(),
             Op::Broadcast(_) => BroadcastI8.into(),
-            Op::Head(head) => {
-                let [first, second] = hidden_layers(&operation.name);
-                HeadI8 { classes: head.classes, hidden: [scale(&first)?, scale(&second)?] }.into()
-            }
             other => unreachable!("{other:?} stays in floating point"),
         })
     }

@@ -40,6 +40,10 @@ pub(super) struct Tables {
 
 impl Tables {
     pub(super) fn new(model: &Model, cameras: usize, options: &SessionOptions) -> Result<Self> {
+        if options.unfolded && model.quantisation().is_some() {
+            let message = "a model of int8 has no graph without the projection fold";
+            return Err(Error::new(ErrorKind::Unsupported, message));
+        }
         let results = Results { logits: options.logits, coarse_heads: options.coarse_heads };
         Self::of_graph(model, model.graph(options.unfolded, results), cameras, options)
     }
