@@ -8,6 +8,7 @@
 mod bench;
 pub(crate) mod draw;
 mod memory;
+pub(crate) mod right_i8;
 
 pub use bench::{Bench, Element, bytes, values};
 pub use draw::{Draw, MAX_WORK, Weights};

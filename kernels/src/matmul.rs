@@ -10,10 +10,11 @@
 //! - `tile`: the loop in registers. Which values it multiplies and sums is an `Arithmetic`.
 //! - `epilogue`: what happens at both ends of the chains, and the type of the outputs.
 //!
-//! [`Product`] puts them together for f32.
+//! [`Product`] puts them together for f32, [`ProductI8`] for 8-bit integers.
 
 pub(crate) mod driver;
 pub(crate) mod epilogue;
+pub mod int8;
 pub mod layout;
 pub(crate) mod product;
 #[cfg(test)]
@@ -22,5 +23,6 @@ pub(crate) mod tile;
 
 pub use driver::BLOCK_ROWS;
 pub use epilogue::Residual;
+pub use int8::{ProductI8, ResidualI8};
 pub use layout::Panels;
 pub use product::{Product, SCRATCH};

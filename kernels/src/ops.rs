@@ -1,6 +1,7 @@
 //! One file per operation: its formula and the order of its sums, its specification, its vector body, its tests.
 
 pub mod conv;
+pub mod conv_i8;
 pub mod deconv3d;
 pub mod deform_conv2d;
 pub mod depthwise;
@@ -41,6 +42,7 @@ macro_rules! registry {
 #[cfg(feature = "cases")]
 registry! {
     conv
+    conv_i8
     deconv3d
     deform_conv2d
     depthwise

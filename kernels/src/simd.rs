@@ -9,12 +9,14 @@
 
 use crate::isa::Isa;
 use crate::quantised::lowest;
+use bytes::Form;
 use half::f16;
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx2;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod avx512;
+pub(crate) mod bytes;
 #[cfg(target_arch = "aarch64")]
 pub(crate) mod neon;
 pub(crate) mod scalar;
@@ -88,6 +90,27 @@ pub(crate) trait Simd: Copy {
         }
         sums
     }
+
+    /// Rows of the largest register tile of bytes; its panels are those of [`Simd::TILE`].
+    fn byte_rows(self) -> usize;
+    /// As [`Simd::rows`], for tiles of bytes.
+    fn rows_of_bytes<B: TileRows<Self>>(self, left: usize, body: B) -> usize;
+    /// Whether [`Simd::multiply_bytes`] reads signed left elements 128 too large, so that sums must start as much lower.
+    fn shifts_bytes(self) -> bool;
+    /// `sums[r][j] += left[r][k] * panels[j][k]` modulo 2^32, exact where the operands are of the form `form`. A panel has 16
+    /// columns of four weights for every four k.
+    ///
+    /// # Safety
+    /// Each pointer in `left` must be valid for reading `depth` bytes, a multiple of 4, each in `panels` for [`LANES`] times
+    /// as many.
+    unsafe fn multiply_bytes<const N: usize, const P: usize>(
+        self,
+        form: Form,
+        left: [*const i8; N],
+        panels: [*const i8; P],
+        depth: usize,
+        sums: [[Self::I; P]; N],
+    ) -> [[Self::I; P]; N];
 
     /// All lanes `x`.
     fn splat(self, x: f32) -> Self::V;
@@ -249,6 +272,18 @@ pub(crate) trait Simd: Copy {
                 let mut lanes = [0; LANES];
                 lanes[..x.len()].copy_from_slice(x);
                 self.load_int(&lanes)
+            }
+        }
+    }
+    /// Writes the first integer lanes into up to 16 values.
+    #[inline(always)]
+    fn store_int_part(self, x: &mut [i32], v: Self::I) {
+        match x.first_chunk_mut::<LANES>() {
+            // SAFETY: the array holds exactly 16 i32.
+            Some(x) => unsafe { self.store_int_ptr(x.as_mut_ptr(), v) },
+            None => {
+                let n = x.len();
+                x.copy_from_slice(&self.int_lanes(v)[..n]);
             }
         }
     }

@@ -21,9 +21,11 @@ use core::ops::Range;
 pub const BLOCK_ROWS: usize = 96;
 /// Bytes of the panels that a tile reads in one k block: three quarters of a 32 KiB first-level cache.
 const PANEL_BYTES: usize = 24 << 10;
+/// Bytes of a cache line.
+const LINE: usize = 64;
 /// Bytes between the end of a row of a block and the start of the next, which keep rows from falling into the same cache
 /// set.
-const GAP_BYTES: usize = 64;
+const GAP_BYTES: usize = LINE;
 /// Pieces of a k block. Shorter pieces than an eighth of it are better copied together.
 pub(crate) const PIECES: usize = 8;
 
@@ -34,7 +36,7 @@ pub(crate) const fn depth<E>() -> usize {
 }
 
 /// Distance between the rows of a block of `E`.
-const fn stride<E>() -> usize {
+pub(crate) const fn stride<E>() -> usize {
     depth::<E>() + GAP_BYTES / size_of::<E>()
 }
 
@@ -182,11 +184,13 @@ pub(crate) struct Product<'a, A, W, T> {
 
 impl<L: Source, W, T: Target> Product<'_, L, W, T> {
     /// Computes `rows` into `out`. `block` has room for [`BLOCK_ROWS`] rows of [`depth`] elements and the gaps behind them,
-    /// `spare` for the panels of a tile in one k block. Both hold anything.
+    /// `spare` for the panels of a tile in one k block, if the weights are stored in another form. Both hold anything.
     #[inline(always)]
+    #[allow(clippy::too_many_arguments, reason = "what is computed, where to, and in which memory")]
     pub(crate) fn compute<A, S, E>(
         &self,
         s: S,
+        arithmetic: A,
         epilogue: &mut E,
         rows: Range<usize>,
         out: &mut [E::Out],
@@ -198,7 +202,8 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
         W: Packed<S, Element = A::Right>,
         E: Epilogue<S, A>,
     {
-        const { assert!(BLOCK_ROWS.is_multiple_of(S::TILE.rows) && 1 <= S::TILE.panels && S::TILE.panels <= 2) }
+        const { assert!(1 <= S::TILE.panels && S::TILE.panels <= 2) }
+        debug_assert!(BLOCK_ROWS.is_multiple_of(arithmetic.tile_rows(s)));
         let panels = self.columns.div_ceil(LANES);
         // Equal k blocks, as few as possible.
         let most = depth::<A::Right>() / S::TILE.panels.min(panels.max(1));
@@ -227,10 +232,10 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
                 while panel < panels {
                     let (k, offsets) = (k..k + depth, &offsets[..count]);
                     if S::TILE.panels == 2 && panels - panel >= 2 {
-                        self.panels::<A, S, E, _, 2>(s, &block, epilogue, panel, k, offsets, out, spare);
+                        self.panels::<A, S, E, _, 2>(s, arithmetic, &block, epilogue, panel, k, offsets, out, spare);
                         panel += 2;
                     } else {
-                        self.panels::<A, S, E, _, 1>(s, &block, epilogue, panel, k, offsets, out, spare);
+                        self.panels::<A, S, E, _, 1>(s, arithmetic, &block, epilogue, panel, k, offsets, out, spare);
                         panel += 1;
                     }
                 }
@@ -249,6 +254,7 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
     fn panels<A, S, E, B, const P: usize>(
         &self,
         s: S,
+        arithmetic: A,
         block: &Block<'_, B, T>,
         epilogue: &mut E,
         panel: usize,
@@ -266,11 +272,17 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
         let (len, count) = (k.len() * LANES, offsets.len());
         let start = |panel: usize| (panel * self.depth + k.start) * LANES;
         let mut weights = [&[][..]; P];
-        for (j, spare) in spare.chunks_exact_mut(depth::<A::Right>() / P * LANES).take(P).enumerate() {
-            weights[j] = self.weights.read(s, start(panel + j), &mut spare[..len]);
+        let share = spare.len() / P;
+        let mut spare = spare;
+        for (j, weights) in weights.iter_mut().enumerate() {
+            let (here, rest) = spare.split_at_mut(share);
+            spare = rest;
+            *weights = self.weights.read(s, start(panel + j), len, here);
         }
         // The panels that are needed next, as far as there are any, in equal shares per tile.
-        let share = len.div_ceil(count.div_ceil(S::TILE.rows)).next_multiple_of(LANES);
+        let tile_rows = arithmetic.tile_rows(s);
+        let line = LINE / size_of::<A::Right>();
+        let share = len.div_ceil(count.div_ceil(tile_rows)).next_multiple_of(line);
         let mut ahead = [core::ptr::null(); P];
         for (j, ahead) in ahead.iter_mut().enumerate() {
             if (panel + P + j) * LANES < self.columns {
@@ -280,12 +292,12 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
         let mut i = 0;
         while i < count {
             for ahead in ahead.iter_mut().filter(|ahead| !ahead.is_null()) {
-                for line in (0..share).step_by(LANES) {
-                    s.prefetch(ahead.wrapping_add(line));
+                for at in (0..share).step_by(line) {
+                    s.prefetch(ahead.wrapping_add(at));
                 }
                 *ahead = ahead.wrapping_add(share);
             }
-            for &offset in &offsets[(i + S::TILE.rows).min(count)..(i + 2 * S::TILE.rows).min(count)] {
+            for &offset in &offsets[(i + tile_rows).min(count)..(i + 2 * tile_rows).min(count)] {
                 for j in 0..P {
                     s.prefetch(out.as_ptr().wrapping_add(offset + (panel + j) * LANES));
                 }
@@ -296,7 +308,7 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
                 ($whole:literal) => {
                     Tile::<A, S, B, T, E, P, $whole> {
                         block,
-                        arithmetic: PhantomData,
+                        arithmetic,
                         epilogue: &mut *epilogue,
                         panels: weights,
                         column: panel * LANES,
@@ -307,9 +319,9 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
                 };
             }
             i += if S::MASKED || self.columns - panel * LANES < P * LANES {
-                s.rows(count - i, tile!(false))
+                arithmetic.rows(s, count - i, tile!(false))
             } else {
-                s.rows(count - i, tile!(true))
+                arithmetic.rows(s, count - i, tile!(true))
             };
         }
     }
@@ -350,6 +362,7 @@ impl<'a, E> Dense<'a, E> {
     pub(crate) fn product<A, S, P>(
         &self,
         s: S,
+        arithmetic: A,
         panels: &[A::Right],
         epilogue: &mut P,
         out: &mut [P::Out],
@@ -370,11 +383,12 @@ impl<'a, E> Dense<'a, E> {
         for (i, panel) in panels.chunks_exact((self.depth * LANES).max(1)).enumerate() {
             let mut first = 0;
             while first < rows {
-                first += s.rows(
+                first += arithmetic.rows(
+                    s,
                     rows - first,
                     Tile::<A, S, Self, Linear, P, 1, true> {
                         block: &block,
-                        arithmetic: PhantomData,
+                        arithmetic,
                         epilogue: &mut *epilogue,
                         panels: [panel],
                         column: i * LANES,

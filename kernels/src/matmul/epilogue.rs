@@ -41,7 +41,7 @@ impl<T: Target, const N: usize> Place<'_, T, N> {
 
     /// Vector `j` of row `r` in a residual whose rows are `stride` apart.
     #[inline(always)]
-    fn residual<const WHOLE: bool>(&self, r: usize, j: usize, stride: usize) -> Range<usize> {
+    pub(crate) fn residual<const WHOLE: bool>(&self, r: usize, j: usize, stride: usize) -> Range<usize> {
         let start = self.target.residual_row(self.row + r) * stride + self.column(j);
         start..start + self.len::<WHOLE>(j)
     }

@@ -47,9 +47,9 @@ impl Panels<'_> {
 pub(crate) trait Packed<S: Simd> {
     /// What a tile reads.
     type Element: Copy;
-    /// As many elements from packed position `i` on as `spare` has: where they are stored, or in `spare` if they are stored
-    /// in another form.
-    fn read<'a>(&'a self, s: S, i: usize, spare: &'a mut [Self::Element]) -> &'a [Self::Element];
+    /// `len` elements from packed position `i` on: where they are stored, or in `spare`, which then holds as many, if they
+    /// are stored in another form.
+    fn read<'a>(&'a self, s: S, i: usize, len: usize, spare: &'a mut [Self::Element]) -> &'a [Self::Element];
     /// Where packed position `i` is stored, if a tile reads it there, else null.
     fn address(&self, i: usize) -> *const Self::Element;
 }
@@ -58,11 +58,12 @@ impl<S: Simd> Packed<S> for Panels<'_> {
     type Element = f32;
 
     #[inline(always)]
-    fn read<'a>(&'a self, s: S, i: usize, spare: &'a mut [f32]) -> &'a [f32] {
+    fn read<'a>(&'a self, s: S, i: usize, len: usize, spare: &'a mut [f32]) -> &'a [f32] {
         match self {
-            Panels::F32(w) => &w[i..][..spare.len()],
+            Panels::F32(w) => &w[i..][..len],
             Panels::F16(w) => {
-                let (narrow, _) = w[i..][..spare.len()].as_chunks();
+                let spare = &mut spare[..len];
+                let (narrow, _) = w[i..][..len].as_chunks();
                 for (narrow, wide) in narrow.iter().zip(spare.as_chunks_mut().0) {
                     s.store(wide, s.widen(narrow));
                 }

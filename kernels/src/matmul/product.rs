@@ -30,10 +30,72 @@ pub struct Product<'a> {
     pub residual: Residual<'a>,
 }
 
-impl Product<'_> {
+/// A right matrix with what happens at both ends of its sums: what convolutions, the head and others multiply by.
+pub(crate) trait Multiply {
+    /// Element of the left matrix.
+    type Left: Copy;
+    /// Element of the output.
+    type Out;
+    /// Element of the scratch.
+    type Scratch;
+
+    /// Output columns.
+    fn columns(&self) -> usize;
+
     /// # Panics
-    /// If a slice does not fit a product of `rows` rows, or the scratch is smaller than [`SCRATCH`].
-    pub(crate) fn check(&self, rows: usize, scratch: &[f32]) {
+    /// If a slice does not fit a product of `rows` rows, or the scratch is too small.
+    fn check(&self, rows: usize, scratch: &[Self::Scratch]);
+
+    /// The specification of row `row`: `a(k)` is the left row, `out` holds the outputs and before that whatever was
+    /// there, `residual_row` is the row in the residual's tensor.
+    fn reference(&self, residual_row: usize, out: &mut [Self::Out], a: impl Fn(usize) -> Self::Left);
+
+    /// Computes `rows` of the product with the left matrix `left`. The scratch is one that passed [`Multiply::check`].
+    fn compute<S: Simd>(
+        &self,
+        s: S,
+        left: &impl Source<Element = Self::Left>,
+        target: &impl Target,
+        rows: Range<usize>,
+        out: &mut [Self::Out],
+        scratch: &mut [Self::Scratch],
+    );
+
+    /// [`Multiply::check`] for the rows `rows` of `total` that go to `out`, `stride` apart.
+    ///
+    /// # Panics
+    /// As [`Multiply::check`], and if `out` does not hold the rows.
+    fn check_rows(
+        &self,
+        rows: &Range<usize>,
+        total: usize,
+        stride: usize,
+        out: &[Self::Out],
+        scratch: &[Self::Scratch],
+    ) {
+        self.check(rows.end, scratch);
+        assert!(rows.start <= rows.end && rows.end <= total, "rows {rows:?} of {total}");
+        assert!(stride >= self.columns(), "output rows overlap");
+        assert!(out.len() >= span(rows.len(), stride, self.columns()), "the output is shorter than its rows");
+    }
+}
+
+impl Product<'_> {
+    fn end(&self) -> End<'_> {
+        End { bias: Some(self.bias), relu: self.relu, residual: self.residual }
+    }
+}
+
+impl Multiply for Product<'_> {
+    type Left = f32;
+    type Out = f32;
+    type Scratch = f32;
+
+    fn columns(&self) -> usize {
+        self.columns
+    }
+
+    fn check(&self, rows: usize, scratch: &[f32]) {
         let padded = self.columns.checked_next_multiple_of(LANES).expect("the columns overflow");
         assert_eq!(Some(self.weights.len()), padded.checked_mul(self.depth), "packed weights do not match the shape");
         assert!(self.bias.len() >= padded, "the bias is shorter than the columns");
@@ -43,27 +105,9 @@ impl Product<'_> {
         assert!(scratch.len() >= SCRATCH, "the scratch is too small");
     }
 
-    /// [`Product::check`] for the rows `rows` of `total` that go to `out`, `stride` apart.
-    ///
-    /// # Panics
-    /// As [`Product::check`], and if `out` does not hold the rows.
-    pub(crate) fn check_rows(&self, rows: &Range<usize>, total: usize, stride: usize, out: &[f32], scratch: &[f32]) {
-        self.check(rows.end, scratch);
-        assert!(rows.start <= rows.end && rows.end <= total, "rows {rows:?} of {total}");
-        assert!(stride >= self.columns, "output rows overlap");
-        assert!(out.len() >= span(rows.len(), stride, self.columns), "the output is shorter than its rows");
-    }
-
-    fn end(&self) -> End<'_> {
-        End { bias: Some(self.bias), relu: self.relu, residual: self.residual }
-    }
-
-    /// The specification of row `row`: `a(k)` is the left row, `out` holds the outputs and before that whatever was
-    /// there, `residual_row` is the row in the residual's tensor.
-    ///
     /// Sixteen chains advance side by side, so that an element of the left row is looked up once for all.
     #[inline(always)]
-    pub(crate) fn reference(&self, residual_row: usize, out: &mut [f32], a: impl Fn(usize) -> f32) {
+    fn reference(&self, residual_row: usize, out: &mut [f32], a: impl Fn(usize) -> f32) {
         let end = self.end();
         for (panel, out) in out.chunks_mut(LANES).enumerate() {
             let column = panel * LANES;
@@ -83,9 +127,8 @@ impl Product<'_> {
         }
     }
 
-    /// Computes `rows` of the product with the left matrix `left`. `scratch` must hold [`SCRATCH`] values.
     #[inline(always)]
-    pub(crate) fn compute<S: Simd>(
+    fn compute<S: Simd>(
         &self,
         s: S,
         left: &impl Source<Element = f32>,
@@ -97,31 +140,31 @@ impl Product<'_> {
         let (block, panels) = scratch[..SCRATCH].split_at_mut(BLOCK_LEN);
         let product =
             driver::Product { left, weights: &self.weights, target, depth: self.depth, columns: self.columns };
-        product.compute::<Single, S, _>(s, &mut self.end(), rows, out, block, panels);
+        product.compute(s, Single, &mut self.end(), rows, out, block, panels);
     }
 }
 
 /// Numbers from the first of `rows` rows, `stride` apart, to the last one's end.
-fn span(rows: usize, stride: usize, columns: usize) -> usize {
+pub(crate) fn span(rows: usize, stride: usize, columns: usize) -> usize {
     rows.checked_sub(1).map_or(0, |before| before.saturating_mul(stride).saturating_add(columns))
 }
 
 /// A product whose output rows go one after the other: what a convolution is.
-pub(crate) struct Rows<'a, A> {
-    pub(crate) product: &'a Product<'a>,
+pub(crate) struct Rows<'a, P: Multiply, A> {
+    pub(crate) product: &'a P,
     pub(crate) source: &'a A,
     pub(crate) rows: Range<usize>,
     /// Distance between rows of `out`, which starts at the first of them.
     pub(crate) stride: usize,
-    pub(crate) out: &'a mut [f32],
-    pub(crate) scratch: &'a mut [f32],
+    pub(crate) out: &'a mut [P::Out],
+    pub(crate) scratch: &'a mut [P::Scratch],
 }
 
-impl<A: Source<Element = f32>> Rows<'_, A> {
+impl<P: Multiply, A: Source<Element = P::Left>> Rows<'_, P, A> {
     /// Computes the rows, of `total`, on `isa`.
     ///
     /// # Panics
-    /// As [`Product::check_rows`].
+    /// As [`Multiply::check_rows`].
     #[inline]
     pub(crate) fn compute(self, isa: Isa, total: usize) {
         self.product.check_rows(&self.rows, total, self.stride, self.out, self.scratch);
@@ -129,14 +172,14 @@ impl<A: Source<Element = f32>> Rows<'_, A> {
     }
 }
 
-impl<A: Source<Element = f32>> Kernel for Rows<'_, A> {
+impl<P: Multiply, A: Source<Element = P::Left>> Kernel for Rows<'_, P, A> {
     type Output = ();
 
     #[inline(always)]
     fn reference(self) {
         let first = self.rows.start;
         for row in self.rows {
-            let out = &mut self.out[(row - first) * self.stride..][..self.product.columns];
+            let out = &mut self.out[(row - first) * self.stride..][..self.product.columns()];
             self.product.reference(
                 row,
                 out,

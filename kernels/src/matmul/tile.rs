@@ -3,10 +3,9 @@
 use super::driver::Target;
 use super::epilogue::{Epilogue, Place};
 use crate::simd::{LANES, Simd, TileRows};
-use core::marker::PhantomData;
 
 /// Which values a product multiplies and sums, and how an instruction set does it.
-pub(crate) trait Arithmetic<S: Simd> {
+pub(crate) trait Arithmetic<S: Simd>: Copy {
     /// Element of the left matrix.
     type Left: Copy;
     /// Element of a packed panel.
@@ -14,8 +13,14 @@ pub(crate) trait Arithmetic<S: Simd> {
     /// Sixteen sums in registers.
     type Sums: Copy;
 
+    /// Rows of the largest tile.
+    fn tile_rows(self, s: S) -> usize;
+
+    /// Calls `body` for as many rows as a tile can have and `left`, which is not 0, allow. Returns how many those were.
+    fn rows<B: TileRows<S>>(self, s: S, left: usize, body: B) -> usize;
+
     /// `sums[r][j] += left[r][k] * panels[j][k]` for k ascending: the loop that the whole library spends its time in.
-    /// Must be `#[inline(always)]`.
+    /// `column` is that of the first panel. Must be `#[inline(always)]`.
     ///
     /// # Panics
     /// If a panel is not `depth` rows of 16.
@@ -23,7 +28,9 @@ pub(crate) trait Arithmetic<S: Simd> {
     /// # Safety
     /// Each pointer must be valid for reading `depth` elements.
     unsafe fn multiply<const N: usize, const P: usize>(
+        self,
         s: S,
+        column: usize,
         left: [*const Self::Left; N],
         panels: [&[Self::Right]; P],
         depth: usize,
@@ -32,6 +39,7 @@ pub(crate) trait Arithmetic<S: Simd> {
 }
 
 /// f32 times f32, summed in f32: one chain of fused multiply-adds per output.
+#[derive(Clone, Copy)]
 pub(crate) struct Single;
 
 impl<S: Simd> Arithmetic<S> for Single {
@@ -40,8 +48,20 @@ impl<S: Simd> Arithmetic<S> for Single {
     type Sums = S::V;
 
     #[inline(always)]
+    fn tile_rows(self, _: S) -> usize {
+        S::TILE.rows
+    }
+
+    #[inline(always)]
+    fn rows<B: TileRows<S>>(self, s: S, left: usize, body: B) -> usize {
+        s.rows(left, body)
+    }
+
+    #[inline(always)]
     unsafe fn multiply<const N: usize, const P: usize>(
+        self,
         s: S,
+        _: usize,
         left: [*const f32; N],
         panels: [&[f32]; P],
         depth: usize,
@@ -88,7 +108,7 @@ where
     E: Epilogue<S, A>,
 {
     pub(crate) block: &'a Block<'a, L, T>,
-    pub(crate) arithmetic: PhantomData<A>,
+    pub(crate) arithmetic: A,
     pub(crate) epilogue: &'a mut E,
     /// The panels, as deep as all pieces together.
     pub(crate) panels: [&'a [A::Right]; P],
@@ -111,7 +131,7 @@ where
 {
     #[inline(always)]
     fn run<const N: usize>(self, s: S) {
-        let Self { block, epilogue, panels, column, first, offsets, out, .. } = self;
+        let Self { block, arithmetic, epilogue, panels, column, first, offsets, out } = self;
         let offsets: &[usize; N] = offsets[first..].first_chunk().expect("the block has these rows");
         let place = Place { column, columns: block.columns, row: block.row + first, target: block.target, offsets };
         let mut sums = if block.first {
@@ -125,7 +145,7 @@ where
             let left = core::array::from_fn(|r| block.left.row(piece, first + r));
             let panels = panels.map(|w| &w[k * LANES..(k + len) * LANES]);
             // SAFETY: `Left` promises that these pointers are good for `len` elements each.
-            sums = unsafe { A::multiply(s, left, panels, len, sums) };
+            sums = unsafe { arithmetic.multiply(s, column, left, panels, len, sums) };
             k += len;
         }
         if block.last {

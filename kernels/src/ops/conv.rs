@@ -12,69 +12,11 @@
 
 use crate::isa::Isa;
 use crate::matmul::Product;
-use crate::matmul::driver::{DEPTH, PIECES, Source};
 use crate::matmul::product::Rows;
-use crate::simd::Simd;
 use core::ops::Range;
 
-/// How a convolution walks its input. The axes are depth, height, width.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Geometry {
-    /// Input extent.
-    pub input: [usize; 3],
-    /// Input channels.
-    pub channels: usize,
-    /// Taps.
-    pub kernel: [usize; 3],
-    /// Input steps per output step.
-    pub stride: [usize; 3],
-    /// Input steps per tap.
-    pub dilation: [usize; 3],
-    /// Zeros before the input; those after it follow from `output`.
-    pub padding: [usize; 3],
-    /// Output extent.
-    pub output: [usize; 3],
-}
-
-impl Geometry {
-    /// Output positions.
-    pub fn rows(&self) -> usize {
-        self.output.iter().product()
-    }
-
-    /// Products per output: taps times channels.
-    pub fn depth(&self) -> usize {
-        self.kernel.iter().product::<usize>() * self.channels
-    }
-
-    /// Output position of row `row`.
-    #[inline(always)]
-    pub(crate) fn position(&self, row: usize) -> [usize; 3] {
-        let [_, h, w] = self.output;
-        [row / (h * w), row / w % h, row % w]
-    }
-
-    /// # Panics
-    /// If an extent is zero, a position cannot be counted, or `input` has another size.
-    pub(crate) fn check(&self, input: &[f32]) {
-        let extents = [self.input, self.kernel, self.stride, self.dilation];
-        assert!(extents.as_flattened().iter().all(|&v| v > 0), "an extent is zero");
-        let product = |of: [usize; 3], by: usize| of.iter().try_fold(by, |a, &b| a.checked_mul(b));
-        let reach = |axis: usize| {
-            let last = self.output[axis].saturating_sub(1).checked_mul(self.stride[axis])?;
-            let tap = (self.kernel[axis] - 1).checked_mul(self.dilation[axis])?;
-            let reach = last.checked_add(tap)?.checked_add(self.padding[axis])?.checked_add(self.input[axis])?;
-            isize::try_from(reach.checked_mul(self.channels.max(1))?).ok()
-        };
-        assert!(
-            (0..3).all(|axis| reach(axis).is_some())
-                && product(self.output, 1).is_some()
-                && product(self.kernel, self.channels).is_some(),
-            "the geometry overflows"
-        );
-        assert_eq!(Some(input.len()), product(self.input, self.channels), "the input has another shape");
-    }
-}
+pub use walk::Geometry;
+pub(crate) use walk::Walk;
 
 /// A convolution's arguments.
 #[derive(Clone, Copy, Debug)]
@@ -98,152 +40,17 @@ pub struct Conv<'a> {
 pub fn conv(isa: Isa, args: &Conv<'_>, rows: Range<usize>, stride: usize, out: &mut [f32], scratch: &mut [f32]) {
     args.geometry.check(args.input);
     assert_eq!(args.product.depth, args.geometry.depth(), "the weights belong to another kernel");
-    Rows { product: &args.product, source: args, rows, stride, out, scratch }.compute(isa, args.geometry.rows());
+    Rows { product: &args.product, source: &args.walk(), rows, stride, out, scratch }
+        .compute(isa, args.geometry.rows());
 }
 
-/// A stretch of k: taps of the last axis, as far as they are contiguous in memory, or more than one such stretch where
-/// they are too short to be worth a pointer each.
-#[derive(Clone, Copy)]
-pub(crate) struct Stretch {
-    /// First tap.
-    tap: [usize; 3],
-    /// Elements of its run that come before the stretch.
-    skip: usize,
-}
-
-impl Conv<'_> {
-    /// Taps that lie side by side in memory.
-    #[inline(always)]
-    fn run_taps(&self) -> usize {
-        if self.geometry.dilation[2] == 1 { self.geometry.kernel[2] } else { 1 }
-    }
-
-    /// The `len` elements from `stretch` on within one run: where they start in the input, if all of them are in it,
-    /// else which of them are, and where those start.
-    #[inline(always)]
-    fn locate(&self, at: [usize; 3], stretch: Stretch, len: usize) -> Result<usize, (Range<usize>, usize)> {
-        let g = &self.geometry;
-        let y = (at[0] * g.stride[0] + stretch.tap[0] * g.dilation[0]).wrapping_sub(g.padding[0]);
-        let x = (at[1] * g.stride[1] + stretch.tap[1] * g.dilation[1]).wrapping_sub(g.padding[1]);
-        if y >= g.input[0] || x >= g.input[1] {
-            return Err((0..0, 0));
-        }
-        let line = (g.input[2] * g.channels) as isize;
-        let column = (at[2] * g.stride[2] + stretch.tap[2] * g.dilation[2]) as isize - g.padding[2] as isize;
-        let start = column * g.channels as isize + stretch.skip as isize;
-        let base = (y * g.input[1] + x) * line as usize;
-        if start >= 0 && start + len as isize <= line {
-            return Ok(base + start as usize);
-        }
-        let before = (-start).clamp(0, len as isize);
-        let end = (line - start).clamp(before, len as isize);
-        Err((before as usize..end as usize, base.wrapping_add_signed(start + before)))
-    }
-
-    /// Writes the elements from `stretch` on, over as many runs as it takes.
-    #[inline(always)]
-    fn write<S: Simd>(&self, s: S, at: [usize; 3], mut stretch: Stretch, mut out: &mut [f32]) {
-        let g = &self.geometry;
-        let taps = self.run_taps();
-        while !out.is_empty() {
-            let len = (taps * g.channels - stretch.skip).min(out.len());
-            let (part, rest) = out.split_at_mut(len);
-            out = rest;
-            match self.locate(at, stretch, len) {
-                Ok(start) => copy(s, &self.input[start..start + len], part),
-                Err((inside, start)) => {
-                    part[..inside.start].fill(0.0);
-                    part[inside.end..].fill(0.0);
-                    let len = inside.len();
-                    part[inside].copy_from_slice(&self.input[if len == 0 { 0..0 } else { start..start + len }]);
-                }
-            }
-            stretch.skip = 0;
-            stretch.tap[2] += taps;
-            if stretch.tap[2] >= g.kernel[2] {
-                stretch.tap = [stretch.tap[0], stretch.tap[1] + 1, 0];
-            }
-            if stretch.tap[1] == g.kernel[1] {
-                stretch.tap = [stretch.tap[0] + 1, 0, 0];
-            }
-        }
+impl<'a> Conv<'a> {
+    pub(crate) fn walk(&self) -> Walk<'a, f32> {
+        Walk { geometry: self.geometry, input: self.input }
     }
 }
 
-impl Source for Conv<'_> {
-    type Element = f32;
-    type At = [usize; 3];
-    type Part = Stretch;
-
-    #[inline(always)]
-    fn element(&self, row: usize, k: usize) -> f32 {
-        let g = &self.geometry;
-        let (tap, c) = (k / g.channels, k % g.channels);
-        let tap = [tap / (g.kernel[1] * g.kernel[2]), tap / g.kernel[2] % g.kernel[1], tap % g.kernel[2]];
-        let position = g.position(row);
-        let mut at = 0;
-        for axis in 0..3 {
-            let x = position[axis] * g.stride[axis] + tap[axis] * g.dilation[axis];
-            if x < g.padding[axis] || x - g.padding[axis] >= g.input[axis] {
-                return 0.0;
-            }
-            at = at * g.input[axis] + x - g.padding[axis];
-        }
-        self.input[at * g.channels + c]
-    }
-
-    #[inline(always)]
-    fn at(&self, row: usize) -> [usize; 3] {
-        self.geometry.position(row)
-    }
-
-    #[inline(always)]
-    fn next(&self, [d, h, w]: [usize; 3]) -> [usize; 3] {
-        let [_, height, width] = self.geometry.output;
-        match (h + 1 == height, w + 1 == width) {
-            (_, false) => [d, h, w + 1],
-            (false, true) => [d, h + 1, 0],
-            (true, true) => [d + 1, 0, 0],
-        }
-    }
-
-    #[inline(always)]
-    fn part(&self, k: usize) -> (Stretch, usize) {
-        let g = &self.geometry;
-        let taps = self.run_taps();
-        let run = taps * g.channels;
-        let (index, skip) = (k / run, k % run);
-        let across = g.kernel[2] / taps;
-        let tap = [index / (across * g.kernel[1]), index / across % g.kernel[1], index % across * taps];
-        let most = if run * PIECES < DEPTH { DEPTH } else { run - skip };
-        (Stretch { tap, skip }, most)
-    }
-
-    #[inline(always)]
-    fn piece<'a, S: Simd>(&'a self, s: S, at: [usize; 3], stretch: Stretch, spare: &'a mut [f32]) -> &'a [f32] {
-        let len = spare.len();
-        if stretch.skip + len <= self.run_taps() * self.geometry.channels
-            && let Ok(start) = self.locate(at, stretch, len)
-        {
-            return &self.input[start..start + len];
-        }
-        self.write(s, at, stretch, spare);
-        spare
-    }
-}
-
-/// Copies equal lengths by vectors: the runs are short, and a call per run would cost as much as the copy.
-#[inline(always)]
-fn copy<S: Simd>(s: S, from: &[f32], to: &mut [f32]) {
-    let (from_chunks, from_rest) = from.as_chunks();
-    let (to_chunks, to_rest) = to.as_chunks_mut();
-    for (from, to) in from_chunks.iter().zip(to_chunks) {
-        s.store(to, s.load(from));
-    }
-    for (from, to) in from_rest.iter().zip(to_rest) {
-        *to = *from;
-    }
-}
+mod walk;
 
 #[cfg(feature = "cases")]
 pub(crate) mod cases;

@@ -13,6 +13,7 @@
 use crate::isa::Isa;
 use crate::matmul::driver::{Source, Target};
 use crate::matmul::layout::packed_len;
+use crate::matmul::product::Multiply;
 use crate::matmul::{Panels, Product, Residual};
 use crate::ops::conv::{Conv, Geometry};
 use crate::simd::{Kernel, Simd, dispatch};
@@ -171,7 +172,7 @@ impl Kernel for Run<'_> {
                         target.residual_row(row),
                         out,
                         #[inline(always)]
-                        |k| conv.element(row, k),
+                        |k| conv.walk().element(row, k),
                     );
                 }
             },
@@ -182,7 +183,7 @@ impl Kernel for Run<'_> {
     fn run<S: Simd>(self, s: S) {
         self.each(
             #[inline(always)]
-            |conv, rows, target, out, scratch| conv.product.compute(s, conv, target, rows, out, scratch),
+            |conv, rows, target, out, scratch| conv.product.compute(s, &conv.walk(), target, rows, out, scratch),
         );
     }
 }

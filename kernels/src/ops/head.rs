@@ -10,6 +10,7 @@
 
 use crate::isa::Isa;
 use crate::matmul::driver::{Linear, Source};
+use crate::matmul::product::Multiply;
 use crate::matmul::{BLOCK_ROWS, Panels, Product, Residual, SCRATCH};
 use crate::simd::{Kernel, Simd, dispatch};
 use core::ops::Range;

@@ -1,5 +1,6 @@
 //! AVX2 + FMA + F16C: a vector is a pair of 8-lane registers.
 
+use super::bytes::{self, Form};
 use super::{Kernel, LANES, Simd, Tile, TileRows};
 use crate::isa::Avx2;
 use core::arch::x86_64::*;
@@ -43,6 +44,31 @@ impl Simd for Avx2 {
             _ => body.run::<1>(self),
         }
         left.min(6)
+    }
+
+    #[inline(always)]
+    fn byte_rows(self) -> usize {
+        bytes::avx2::tile_rows(self)
+    }
+    #[inline(always)]
+    fn rows_of_bytes<B: TileRows<Self>>(self, left: usize, body: B) -> usize {
+        bytes::avx2::rows(self, left, body)
+    }
+    #[inline(always)]
+    fn shifts_bytes(self) -> bool {
+        self.vnni().is_some()
+    }
+    #[inline(always)]
+    unsafe fn multiply_bytes<const N: usize, const P: usize>(
+        self,
+        form: Form,
+        left: [*const i8; N],
+        panels: [*const i8; P],
+        depth: usize,
+        sums: [[Self::I; P]; N],
+    ) -> [[Self::I; P]; N] {
+        // SAFETY: the caller's promise is passed on.
+        unsafe { bytes::avx2::multiply(self, form, left, panels, depth, sums) }
     }
 
     #[inline(always)]

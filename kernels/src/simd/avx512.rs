@@ -1,5 +1,6 @@
 //! AVX-512 F, VL, DQ and BW: a vector is one 16-lane register, and a part of one is a mask.
 
+use super::bytes::{self, Form};
 use super::{Kernel, LANES, Simd, Tile, TileRows};
 use crate::isa::Avx512;
 use core::arch::x86_64::*;
@@ -47,6 +48,31 @@ impl Simd for Avx512 {
             3.. => (body.run::<3>(self), 3).1,
             _ => (body.run::<1>(self), 1).1,
         }
+    }
+
+    #[inline(always)]
+    fn byte_rows(self) -> usize {
+        bytes::avx512::TILE_ROWS
+    }
+    #[inline(always)]
+    fn rows_of_bytes<B: TileRows<Self>>(self, left: usize, body: B) -> usize {
+        bytes::avx512::rows(self, left, body)
+    }
+    #[inline(always)]
+    fn shifts_bytes(self) -> bool {
+        self.vnni().is_some()
+    }
+    #[inline(always)]
+    unsafe fn multiply_bytes<const N: usize, const P: usize>(
+        self,
+        form: Form,
+        left: [*const i8; N],
+        panels: [*const i8; P],
+        depth: usize,
+        sums: [[Self::I; P]; N],
+    ) -> [[Self::I; P]; N] {
+        // SAFETY: the caller's promise is passed on.
+        unsafe { bytes::avx512::multiply(self, form, left, panels, depth, sums) }
     }
 
     #[inline(always)]
@@ -249,6 +275,11 @@ impl Simd for Avx512 {
     fn store_bytes_part(self, x: &mut [i8], v: Self::B) {
         // SAFETY: lanes beyond the slice are masked, and masked lanes are not written; the token proves AVX-512 BW and VL.
         unsafe { _mm_mask_storeu_epi8(x.as_mut_ptr(), first(x.len()), v) }
+    }
+    #[inline(always)]
+    fn store_int_part(self, x: &mut [i32], v: Self::I) {
+        // SAFETY: lanes beyond the slice are masked, and masked lanes are not written; the token proves AVX-512 F.
+        unsafe { _mm512_mask_storeu_epi32(x.as_mut_ptr(), first(x.len()), v) }
     }
     #[inline(always)]
     fn load_int_part(self, x: &[i32]) -> Self::I {

@@ -2,6 +2,7 @@
 //!
 //! Where an instruction has no intrinsic in the oldest compiler that this crate supports, it is written as assembly.
 
+use super::bytes::{self, Form};
 use super::{Kernel, LANES, Simd, Tile, TileRows};
 use crate::isa::Neon;
 use core::arch::aarch64::*;
@@ -118,6 +119,31 @@ impl Simd for Neon {
             }
         }
         sums
+    }
+
+    #[inline(always)]
+    fn byte_rows(self) -> usize {
+        bytes::neon::tile_rows(self)
+    }
+    #[inline(always)]
+    fn rows_of_bytes<B: TileRows<Self>>(self, left: usize, body: B) -> usize {
+        bytes::neon::rows(self, left, body)
+    }
+    #[inline(always)]
+    fn shifts_bytes(self) -> bool {
+        false
+    }
+    #[inline(always)]
+    unsafe fn multiply_bytes<const N: usize, const P: usize>(
+        self,
+        form: Form,
+        left: [*const i8; N],
+        panels: [*const i8; P],
+        depth: usize,
+        sums: [[Self::I; P]; N],
+    ) -> [[Self::I; P]; N] {
+        // SAFETY: the caller's promise is passed on.
+        unsafe { bytes::neon::multiply(self, form, left, panels, depth, sums) }
     }
 
     #[inline(always)]

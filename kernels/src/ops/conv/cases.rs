@@ -69,55 +69,58 @@ fn bench(name: &str, geometry: Geometry, columns: usize) -> Bench {
 }
 
 /// A square kernel on an image, padded so that the output is the input over the stride.
-fn image(name: &str, [h, w]: [usize; 2], widths: [usize; 2], kernel: usize, stride: usize) -> Bench {
-    let geometry = Geometry {
+fn image([h, w]: [usize; 2], channels: usize, kernel: usize, stride: usize) -> Geometry {
+    Geometry {
         input: [1, h, w],
-        channels: widths[0],
+        channels,
         kernel: [1, kernel, kernel],
         stride: [1, stride, stride],
         dilation: [1; 3],
         padding: [0, kernel / 2, kernel / 2],
         output: [1, h.div_ceil(stride), w.div_ceil(stride)],
-    };
-    bench(name, geometry, widths[1])
+    }
 }
 
 /// A 3x3x3 kernel on a volume.
-fn volume(name: &str, extent: [usize; 3], width: usize) -> Bench {
-    let geometry = Geometry {
+fn volume(extent: [usize; 3], channels: usize) -> Geometry {
+    Geometry {
         input: extent,
-        channels: width,
+        channels,
         kernel: [3; 3],
         stride: [1; 3],
         dilation: [1; 3],
         padding: [1; 3],
         output: extent,
-    };
-    bench(name, geometry, width)
+    }
 }
 
-/// Of `nuscenes-200` at 928 x 1600 pixels, one camera. A stage's first block halves the image.
-pub(crate) fn benches() -> Vec<Bench> {
+/// The convolutions of `nuscenes-200` at 928 x 1600 pixels, one camera: input, walk, output channels. A stage's first block
+/// halves the image.
+pub(crate) fn shapes() -> Vec<(&'static str, Geometry, usize)> {
     std::vec![
-        image("stem 7x7 3-64 stride 2", [928, 1600], [3, 64], 7, 2),
-        image("layer1 1x1 64-64", [232, 400], [64, 64], 1, 1),
-        image("layer1 1x1 64-256", [232, 400], [64, 256], 1, 1),
-        image("layer1 1x1 256-64", [232, 400], [256, 64], 1, 1),
-        image("layer1 3x3 64", [232, 400], [64, 64], 3, 1),
-        image("layer2 1x1 256-128 stride 2", [232, 400], [256, 128], 1, 2),
-        image("layer2 1x1 256-512 stride 2", [232, 400], [256, 512], 1, 2),
-        image("layer2 1x1 128-512", [116, 200], [128, 512], 1, 1),
-        image("layer2 1x1 512-128", [116, 200], [512, 128], 1, 1),
-        image("layer2 3x3 128", [116, 200], [128, 128], 3, 1),
-        image("layer3 1x1 256-1024", [58, 100], [256, 1024], 1, 1),
-        image("layer3 1x1 1024-256", [58, 100], [1024, 256], 1, 1),
-        image("layer3 offsets 3x3 256-27", [58, 100], [256, 27], 3, 1),
-        image("layer4 1x1 512-2048", [29, 50], [512, 2048], 1, 1),
-        image("layer4 1x1 2048-512", [29, 50], [2048, 512], 1, 1),
-        image("layer4 offsets 3x3 512-27", [29, 50], [512, 27], 3, 1),
-        image("folded fpn level1 3x3 512-128", [116, 200], [512, 128], 3, 1),
-        volume("level1 3x3x3 64", [100, 100, 8], 64),
-        volume("level3 3x3x3 256", [25, 25, 2], 256),
-        volume("refine0 3x3x3 32", [200, 200, 16], 32),
+        ("stem 7x7 3-64 stride 2", image([928, 1600], 3, 7, 2), 64),
+        ("layer1 1x1 64-64", image([232, 400], 64, 1, 1), 64),
+        ("layer1 1x1 64-256", image([232, 400], 64, 1, 1), 256),
+        ("layer1 1x1 256-64", image([232, 400], 256, 1, 1), 64),
+        ("layer1 3x3 64", image([232, 400], 64, 3, 1), 64),
+        ("layer2 1x1 256-128 stride 2", image([232, 400], 256, 1, 2), 128),
+        ("layer2 1x1 256-512 stride 2", image([232, 400], 256, 1, 2), 512),
+        ("layer2 1x1 128-512", image([116, 200], 128, 1, 1), 512),
+        ("layer2 1x1 512-128", image([116, 200], 512, 1, 1), 128),
+        ("layer2 3x3 128", image([116, 200], 128, 3, 1), 128),
+        ("layer3 1x1 256-1024", image([58, 100], 256, 1, 1), 1024),
+        ("layer3 1x1 1024-256", image([58, 100], 1024, 1, 1), 256),
+        ("layer3 offsets 3x3 256-27", image([58, 100], 256, 3, 1), 27),
+        ("layer4 1x1 512-2048", image([29, 50], 512, 1, 1), 2048),
+        ("layer4 1x1 2048-512", image([29, 50], 2048, 1, 1), 512),
+        ("layer4 offsets 3x3 512-27", image([29, 50], 512, 3, 1), 27),
+        ("folded fpn level1 3x3 512-128", image([116, 200], 512, 3, 1), 128),
+        ("level1 3x3x3 64", volume([100, 100, 8], 64), 64),
+        ("level3 3x3x3 256", volume([25, 25, 2], 256), 256),
+        ("refine0 3x3x3 32", volume([200, 200, 16], 32), 32),
     ]
+}
+
+pub(crate) fn benches() -> Vec<Bench> {
+    shapes().into_iter().map(|(name, geometry, columns)| bench(name, geometry, columns)).collect()
 }

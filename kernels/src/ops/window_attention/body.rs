@@ -236,5 +236,5 @@ fn softmax<S: Simd>(s: S, scores: &mut [f32], offsets: &[f32], tokens: usize, sc
 #[inline(always)]
 fn product<S: Simd>(s: S, left: Dense<'_, f32>, panels: &[f32], bias: Option<&[f32]>, out: &mut [f32], columns: usize) {
     let mut end = End { bias, relu: false, residual: Residual::None };
-    left.product::<Single, S, _>(s, panels, &mut end, out, columns);
+    left.product(s, Single, panels, &mut end, out, columns);
 }

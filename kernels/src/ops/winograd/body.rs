@@ -70,7 +70,7 @@ impl<S: Simd, const P: usize> TileRows<S> for Sums<'_, P> {
                 (here[j], weights[j]) = weights[j].split_at(len * LANES);
             }
             // SAFETY: each pointer was good for what is left of the block, of which this is the next part.
-            let sums = unsafe { Single::multiply(s, left, here, len, [[s.splat(0.0); P]; N]) };
+            let sums = unsafe { Single.multiply(s, 0, left, here, len, [[s.splat(0.0); P]; N]) };
             for j in 0..P {
                 let out: &mut [_; N] = out[j * rows + row..].first_chunk_mut().expect("the block has these rows");
                 for r in 0..N {
