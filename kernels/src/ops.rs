@@ -5,15 +5,24 @@ pub mod conv_i8;
 pub mod deconv3d;
 pub mod deform_conv2d;
 pub mod depthwise;
+pub mod depthwise_i8;
+pub mod dequantise;
 pub mod gate;
+pub mod gate_i8;
 pub mod gather;
+pub mod gather_i8;
 pub mod head;
 pub mod max_pool;
+pub mod max_pool_i8;
+pub mod mean_i8;
 pub mod normalise;
+pub mod normalise_i8;
 pub mod pool;
 pub mod project;
+pub mod quantise;
 pub mod scale_shift;
 pub mod upsample_add;
+pub mod upsample_add_i8;
 pub mod window_attention;
 pub mod winograd;
 
@@ -37,15 +46,24 @@ registry! {
     deconv3d
     deform_conv2d
     depthwise
+    depthwise_i8
+    dequantise
     gate
+    gate_i8
     gather
+    gather_i8
     head
     max_pool
+    max_pool_i8
+    mean_i8
     normalise
+    normalise_i8
     pool
     project
+    quantise
     scale_shift
     upsample_add
+    upsample_add_i8
     window_attention
     winograd
 }

@@ -19,9 +19,9 @@ use core::ops::Range;
 
 /// A depthwise convolution's arguments.
 #[derive(Clone, Copy, Debug)]
-pub struct Depthwise<'a> {
+pub struct Depthwise<'a, T = f32, B = f32> {
     /// `[height, width, channels]`.
-    pub input: &'a [f32],
+    pub input: &'a [T],
     /// Rows of the input and of the output.
     pub height: usize,
     /// Columns of the input and of the output.
@@ -31,15 +31,15 @@ pub struct Depthwise<'a> {
     /// Side of the kernel, odd.
     pub kernel: usize,
     /// `[kernel, kernel, channels]`, each tap's channels padded with anything to a multiple of 16.
-    pub weights: &'a [f32],
+    pub weights: &'a [T],
     /// One value per channel, padded likewise.
-    pub bias: &'a [f32],
+    pub bias: &'a [B],
     /// Whether the input itself is added.
     pub residual: bool,
 }
 
-impl Depthwise<'_> {
-    fn check(&self, rows: &Range<usize>, out: &[f32]) {
+impl<T: Copy, B: Copy> Depthwise<'_, T, B> {
+    pub(super) fn check(&self, rows: &Range<usize>, out: &[T]) {
         let padded = self.channels.next_multiple_of(LANES);
         assert!(self.channels > 0 && self.width > 0, "an extent is zero");
         assert!(self.kernel % 2 == 1, "the kernel's side is not odd");
@@ -96,64 +96,135 @@ impl Kernel for Run<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let a = self.args;
-        let half = a.kernel / 2;
-        for (y, out) in self.rows.zip(self.out.chunks_exact_mut(a.width * a.channels)) {
-            let mut x = 0;
-            while x < a.width {
-                // Columns from here on, no tap of which leaves the row.
-                let inside = if x >= half { a.width.saturating_sub(x + half) } else { 0 };
-                x += s.rows(inside.max(1), Columns { args: a, y, x, out: &mut out[x * a.channels..] });
-            }
-        }
+        self.args.rows(s, Chains, self.rows, self.out);
+    }
+}
+
+/// What the body computes with: elements, and vectors of them and of their sums.
+pub(super) trait Arithmetic<S: Simd, T, B>: Copy {
+    /// Sixteen elements, weights or sums.
+    type Lanes: Copy;
+    /// Sixteen times zero.
+    fn zero(self, s: S) -> Self::Lanes;
+    /// Sixteen values of the bias.
+    fn bias(self, s: S, bias: &[B; LANES]) -> Self::Lanes;
+    /// Sixteen elements from `x` on.
+    ///
+    /// # Safety
+    /// `x` must be valid for reading as many.
+    unsafe fn load_ptr(self, s: S, x: *const T) -> Self::Lanes;
+    /// Up to sixteen elements.
+    fn load_part(self, s: S, x: &[T]) -> Self::Lanes;
+    /// `x * w + sum`.
+    fn mul_add(self, s: S, x: Self::Lanes, w: Self::Lanes, sum: Self::Lanes) -> Self::Lanes;
+    /// Makes outputs of the sums of channels from `channel` on, whose inputs here are `x` if they are to be added.
+    fn finish(self, s: S, channel: usize, sum: Self::Lanes, x: Option<Self::Lanes>, out: &mut [T]);
+}
+
+/// Chains of fused multiply-adds.
+#[derive(Clone, Copy)]
+struct Chains;
+
+impl<S: Simd> Arithmetic<S, f32, f32> for Chains {
+    type Lanes = S::V;
+    #[inline(always)]
+    fn zero(self, s: S) -> S::V {
+        s.splat(0.0)
+    }
+    #[inline(always)]
+    fn bias(self, s: S, bias: &[f32; LANES]) -> S::V {
+        s.load(bias)
+    }
+    #[inline(always)]
+    unsafe fn load_ptr(self, s: S, x: *const f32) -> S::V {
+        // SAFETY: the caller's promise.
+        unsafe { s.load_ptr(x) }
+    }
+    #[inline(always)]
+    fn load_part(self, s: S, x: &[f32]) -> S::V {
+        s.load_part(x)
+    }
+    #[inline(always)]
+    fn mul_add(self, s: S, x: S::V, w: S::V, sum: S::V) -> S::V {
+        s.mul_add(x, w, sum)
+    }
+    #[inline(always)]
+    fn finish(self, s: S, _: usize, sum: S::V, x: Option<S::V>, out: &mut [f32]) {
+        s.store_part(out, x.map_or(sum, |x| s.add(sum, x)));
     }
 }
 
 /// All channels of some columns from `x` on in row `y`. If they are more than one, no tap may leave the row.
-struct Columns<'a> {
-    args: &'a Depthwise<'a>,
+struct Columns<'a, A, T, B> {
+    args: &'a Depthwise<'a, T, B>,
+    arithmetic: A,
     y: usize,
     x: usize,
-    out: &'a mut [f32],
+    out: &'a mut [T],
 }
 
-impl<S: Simd> TileRows<S> for Columns<'_> {
+impl<S: Simd, A: Arithmetic<S, T, B>, T: Copy, B: Copy> TileRows<S> for Columns<'_, A, T, B> {
     #[inline(always)]
     fn run<const N: usize>(self, s: S) {
-        let Self { args, y, x, out } = self;
+        let Self { args, arithmetic, y, x, out } = self;
         let whole = args.channels / LANES * LANES;
         for c in (0..whole).step_by(LANES) {
-            args.tile::<S, N, true>(s, [y, x, c], out);
+            args.tile::<S, A, N, true>(s, arithmetic, [y, x, c], out);
         }
         if whole < args.channels {
-            args.tile::<S, N, false>(s, [y, x, whole], out);
+            args.tile::<S, A, N, false>(s, arithmetic, [y, x, whole], out);
         }
     }
 }
 
-impl Depthwise<'_> {
+impl<T: Copy, B: Copy> Depthwise<'_, T, B> {
     /// Where the pixel at (`y`, `x`) of the zero-padded input is stored, or `None` in the padding.
     #[inline(always)]
-    fn offset(&self, y: usize, x: usize) -> Option<usize> {
+    pub(super) fn offset(&self, y: usize, x: usize) -> Option<usize> {
         let (y, x) = (y.wrapping_sub(self.kernel / 2), x.wrapping_sub(self.kernel / 2));
         (y < self.height && x < self.width).then(|| (y * self.width + x) * self.channels)
+    }
+
+    /// The body.
+    #[inline(always)]
+    pub(super) fn rows<S: Simd>(&self, s: S, arithmetic: impl Arithmetic<S, T, B>, rows: Range<usize>, out: &mut [T]) {
+        let half = self.kernel / 2;
+        for (y, out) in rows.zip(out.chunks_exact_mut(self.width * self.channels)) {
+            let mut x = 0;
+            while x < self.width {
+                // Columns from here on, no tap of which leaves the row.
+                let inside = if x >= half { self.width.saturating_sub(x + half) } else { 0 };
+                x +=
+                    s.rows(inside.max(1), Columns { args: self, arithmetic, y, x, out: &mut out[x * self.channels..] });
+            }
+        }
     }
 
     /// Up to 16 channels of [`Columns`], from `c` on; all 16 if `WHOLE`, which spares the accumulators the call
     /// that a part of a vector takes.
     #[inline(always)]
-    fn tile<S: Simd, const N: usize, const WHOLE: bool>(&self, s: S, [y, x, c]: [usize; 3], out: &mut [f32]) {
+    fn tile<S: Simd, A: Arithmetic<S, T, B>, const N: usize, const WHOLE: bool>(
+        &self,
+        s: S,
+        arithmetic: A,
+        [y, x, c]: [usize; 3],
+        out: &mut [T],
+    ) {
         let padded = self.channels.next_multiple_of(LANES);
         let lanes = if WHOLE { LANES } else { self.channels - c };
+        let whole = |x: &[T; LANES]| {
+            // SAFETY: the array holds 16 elements.
+            unsafe { arithmetic.load_ptr(s, x.as_ptr()) }
+        };
         let load = |at: usize| {
             let x = &self.input[at..at + lanes];
-            if WHOLE { s.load(x.first_chunk().expect("16 channels")) } else { s.load_part(x) }
+            if WHOLE { whole(x.first_chunk().expect("16 channels")) } else { arithmetic.load_part(s, x) }
         };
         let weights = |ky: usize, kx: usize| {
             let w = &self.weights[(ky * self.kernel + kx) * padded + c..];
-            s.load(w.first_chunk().expect("padded channels"))
+            whole(w.first_chunk().expect("padded channels"))
         };
-        let mut sums = [s.load(self.bias[c..].first_chunk().expect("padded channels")); N];
+        let mut sums = [arithmetic.bias(s, self.bias[c..].first_chunk().expect("padded channels")); N];
         for ky in 0..self.kernel {
             // Where no tap leaves the row, all of a row of taps are one piece of memory.
             let piece = if N > 1 { self.offset(y + ky, x) } else { None };
@@ -165,28 +236,26 @@ impl Depthwise<'_> {
                         for (i, sum) in sums.iter_mut().enumerate() {
                             let at = (kx + i) * self.channels;
                             let x = if WHOLE {
-                                // SAFETY: kx < kernel and i < N, so these 16 numbers end where the piece does, at most.
-                                unsafe { s.load_ptr(piece.as_ptr().add(at)) }
+                                // SAFETY: kx < kernel and i < N, so these 16 elements end where the piece does, at most.
+                                unsafe { arithmetic.load_ptr(s, piece.as_ptr().add(at)) }
                             } else {
-                                s.load_part(&piece[at..][..lanes])
+                                arithmetic.load_part(s, &piece[at..][..lanes])
                             };
-                            *sum = s.mul_add(x, w, *sum);
+                            *sum = arithmetic.mul_add(s, x, w, *sum);
                         }
                     }
                     None => {
                         for (i, sum) in sums.iter_mut().enumerate() {
-                            let x = self.offset(y + ky, x + i + kx).map_or(s.splat(0.0), |at| load(at + c));
-                            *sum = s.mul_add(x, w, *sum);
+                            let x = self.offset(y + ky, x + i + kx).map_or(arithmetic.zero(s), |at| load(at + c));
+                            *sum = arithmetic.mul_add(s, x, w, *sum);
                         }
                     }
                 }
             }
         }
-        for (i, mut sum) in sums.into_iter().enumerate() {
-            if self.residual {
-                sum = s.add(sum, load((y * self.width + x + i) * self.channels + c));
-            }
-            s.store_part(&mut out[i * self.channels + c..][..lanes], sum);
+        for (i, sum) in sums.into_iter().enumerate() {
+            let x = self.residual.then(|| load((y * self.width + x + i) * self.channels + c));
+            arithmetic.finish(s, c, sum, x, &mut out[i * self.channels + c..][..lanes]);
         }
     }
 }

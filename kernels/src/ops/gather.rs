@@ -77,7 +77,7 @@ impl<'a> Iterator for Kept<'a> {
 
 /// A gather's arguments.
 #[derive(Clone, Copy, Debug)]
-pub struct Gather<'a> {
+pub struct Gather<'a, T = f32, B = f32> {
     /// `rows + 1` ascending offsets into `col`.
     pub ptr: &'a [u32],
     /// Feature pixel of each entry, below `features.len() / stride`; ascending within a row if there is a mask.
@@ -85,7 +85,7 @@ pub struct Gather<'a> {
     /// Cameras to leave out.
     pub mask: Option<Mask<'a>>,
     /// Feature pixels, `stride` values apart.
-    pub features: &'a [f32],
+    pub features: &'a [T],
     /// Distance between feature pixels.
     pub stride: usize,
     /// First channel that is gathered.
@@ -93,7 +93,7 @@ pub struct Gather<'a> {
     /// Channels that are gathered.
     pub channels: usize,
     /// Added to the mean, one value per channel.
-    pub bias: Option<&'a [f32]>,
+    pub bias: Option<&'a [B]>,
     /// Whether negative results become 0.
     pub relu: bool,
 }
@@ -106,13 +106,7 @@ pub struct Gather<'a> {
 /// # Determinism
 /// The same bits on every instruction set and for every division into rows.
 pub fn gather(isa: Isa, args: &Gather<'_>, rows: Range<usize>, out: &mut [f32]) {
-    let behind = args.stride.checked_sub(args.first_channel);
-    assert!(behind.is_some_and(|c| c >= args.channels), "channels out of range");
-    assert!(u32::try_from(args.stride).is_ok(), "the stride is out of range");
-    let total = args.ptr.len().saturating_sub(1);
-    assert!(rows.start <= rows.end && rows.end <= total, "rows {rows:?} of {total}");
-    assert_eq!(out.len(), rows.len() * args.channels, "the output does not hold the rows");
-    assert!(args.bias.is_none_or(|b| b.len() >= args.channels), "the bias is shorter than the channels");
+    args.check(&rows, out);
     dispatch(isa, Run { args, rows, out });
 }
 
@@ -122,15 +116,27 @@ struct Run<'a> {
     out: &'a mut [f32],
 }
 
-impl Gather<'_> {
-    fn row(&self, row: usize) -> Kept<'_> {
+impl<T, B> Gather<'_, T, B> {
+    /// Checks everything but the entries of `ptr` and `col`.
+    pub(super) fn check(&self, rows: &Range<usize>, out: &[T]) {
+        let behind = self.stride.checked_sub(self.first_channel);
+        assert!(behind.is_some_and(|c| c >= self.channels), "channels out of range");
+        assert!(u32::try_from(self.stride).is_ok(), "the stride is out of range");
+        let total = self.ptr.len().saturating_sub(1);
+        assert!(rows.start <= rows.end && rows.end <= total, "rows {rows:?} of {total}");
+        assert_eq!(out.len(), rows.len() * self.channels, "the output does not hold the rows");
+        assert!(self.bias.is_none_or(|b| b.len() >= self.channels), "the bias is shorter than the channels");
+    }
+
+    /// The entries of a row that no mask leaves out.
+    pub(super) fn row(&self, row: usize) -> Kept<'_> {
         Kept { mask: self.mask, rest: &self.col[self.ptr[row] as usize..self.ptr[row + 1] as usize] }
     }
 
     /// Where gathered channel `channel` of pixel `col` is among the features. An offset that no slice has where this is
     /// beyond the address space; 64 bits hold it, because neither a pixel nor the stride exceeds 32.
     #[inline(always)]
-    fn offset(&self, col: u32, channel: usize) -> usize {
+    pub(super) fn offset(&self, col: u32, channel: usize) -> usize {
         let offset = u64::from(col) * self.stride as u64 + (self.first_channel + channel) as u64;
         usize::try_from(offset).unwrap_or(usize::MAX)
     }
@@ -140,7 +146,7 @@ impl Gather<'_> {
     /// # Panics
     /// If one does not.
     #[inline(always)]
-    fn check_pixels(&self, cols: &[u32]) {
+    pub(super) fn check_pixels(&self, cols: &[u32]) {
         if let Some(last) = cols.iter().copied().max() {
             let end = self.offset(last, 0).saturating_add(self.channels);
             assert!(end <= self.features.len(), "pixel {last} is out of range");

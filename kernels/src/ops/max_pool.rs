@@ -16,9 +16,9 @@ use core::ops::Range;
 
 /// A max pooling's arguments.
 #[derive(Clone, Copy, Debug)]
-pub struct MaxPool<'a> {
+pub struct MaxPool<'a, T = f32> {
     /// `[height, width, channels]`.
-    pub input: &'a [f32],
+    pub input: &'a [T],
     /// Rows of the input.
     pub height: usize,
     /// Columns of the input.
@@ -33,13 +33,13 @@ pub struct MaxPool<'a> {
     pub padding: usize,
 }
 
-impl MaxPool<'_> {
+impl<T> MaxPool<'_, T> {
     /// Rows and columns of the output. Needs a stride and a kernel that fits into the padded input.
     pub fn output(&self) -> [usize; 2] {
         [self.height, self.width].map(|extent| (extent + 2 * self.padding - self.kernel) / self.stride + 1)
     }
 
-    fn check(&self, rows: &Range<usize>, out: &[f32]) {
+    pub(super) fn check(&self, rows: &Range<usize>, out: &[T]) {
         let extents = [self.height, self.width, self.channels, self.kernel, self.stride];
         assert!(extents.iter().all(|&v| v > 0), "an extent is zero");
         assert!(self.padding < self.kernel, "a window may lie in the padding alone");
@@ -52,7 +52,7 @@ impl MaxPool<'_> {
 
     /// The input positions on an axis of `extent` that output position `at` sees.
     #[inline(always)]
-    fn window(&self, at: usize, extent: usize) -> Range<usize> {
+    pub(super) fn window(&self, at: usize, extent: usize) -> Range<usize> {
         let start = at * self.stride;
         start.saturating_sub(self.padding)..extent.min(start + self.kernel - self.padding)
     }

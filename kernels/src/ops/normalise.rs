@@ -13,15 +13,32 @@ pub const BGR_MEAN: [f32; 3] = [103.530, 116.280, 123.675];
 /// # Panics
 /// If `image` is not `height * width * 3` bytes, or `out` is not whole rows.
 pub fn normalise(image: &[u8], height: usize, width: usize, padded_width: usize, first_row: usize, out: &mut [f32]) {
+    fill(image, [height, width], padded_width, first_row, out, |pixel| {
+        core::array::from_fn::<_, 3, _>(|c| f32::from(pixel[c]) - BGR_MEAN[c])
+    });
+}
+
+/// Rows `first_row..` of the padded image into `out`: what `value` makes of a pixel, and zero where there is none.
+///
+/// # Panics
+/// As [`normalise`].
+pub(super) fn fill<T: Copy + Default, const N: usize>(
+    image: &[u8],
+    [height, width]: [usize; 2],
+    padded_width: usize,
+    first_row: usize,
+    out: &mut [T],
+    value: impl Fn([u8; 3]) -> [T; N],
+) {
     assert_eq!(image.len(), height * width * 3, "the image has another size");
-    assert!(padded_width >= width && out.len().is_multiple_of(padded_width * 3), "the output is not whole rows");
-    for (i, row) in out.chunks_exact_mut(padded_width * 3).enumerate() {
-        let (pixels, padding) = row.split_at_mut(if first_row + i < height { width * 3 } else { 0 });
-        padding.fill(0.0);
+    assert!(padded_width >= width && out.len().is_multiple_of(padded_width * N), "the output is not whole rows");
+    for (i, row) in out.chunks_exact_mut(padded_width * N).enumerate() {
+        let (pixels, padding) = row.split_at_mut(if first_row + i < height { width * N } else { 0 });
+        padding.fill(T::default());
         if !pixels.is_empty() {
             let from = &image[(first_row + i) * width * 3..][..width * 3];
-            for (to, from) in pixels.as_chunks_mut::<3>().0.iter_mut().zip(from.as_chunks::<3>().0) {
-                *to = core::array::from_fn(|c| f32::from(from[c]) - BGR_MEAN[c]);
+            for (to, from) in pixels.as_chunks_mut::<N>().0.iter_mut().zip(from.as_chunks::<3>().0) {
+                *to = value(*from);
             }
         }
     }

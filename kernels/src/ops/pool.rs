@@ -13,24 +13,24 @@ use crate::simd::{Kernel, LANES, Simd, dispatch};
 
 /// A global mean's arguments.
 #[derive(Clone, Copy, Debug)]
-pub struct Mean<'a> {
+pub struct Mean<'a, T = f32> {
     /// `[rows, channels]`, at least one row and at most 2^24, so that their number is exact in f32.
-    pub input: &'a [f32],
+    pub input: &'a [T],
     /// Channels.
     pub channels: usize,
 }
 
-impl Mean<'_> {
-    fn check(&self, out: &[f32]) {
+impl<T> Mean<'_, T> {
+    pub(super) fn check(&self, out: &[T]) {
         assert!(self.channels > 0, "an extent is zero");
         assert!(self.input.len().is_multiple_of(self.channels), "the input is not whole rows");
-        let rows = self.input.len() / self.channels;
+        let rows = self.rows();
         assert!((1..=1 << 24).contains(&rows), "the mean of {rows} rows");
         assert_eq!(out.len(), self.channels, "the output is not one row");
     }
 
-    fn rows(&self) -> f32 {
-        (self.input.len() / self.channels) as f32
+    pub(super) fn rows(&self) -> usize {
+        self.input.len() / self.channels
     }
 }
 
@@ -61,7 +61,7 @@ impl Kernel for Run<'_> {
             for row in self.args.input.chunks_exact(self.args.channels) {
                 sum += row[c];
             }
-            *out = sum / self.args.rows();
+            *out = sum / self.args.rows() as f32;
         }
     }
 
@@ -72,17 +72,17 @@ impl Kernel for Run<'_> {
             for row in self.args.input.chunks_exact(self.args.channels) {
                 sum = s.add(sum, s.load_part(&row[panel * LANES..][..out.len()]));
             }
-            s.store_part(out, s.div(sum, s.splat(self.args.rows())));
+            s.store_part(out, s.div(sum, s.splat(self.args.rows() as f32)));
         }
     }
 }
 
-/// Copies `row` into channels `offset..offset + row.len()` of every row of `out`, `[rows, stride]`. The other channels
+/// Copies `row`, of any element, into channels `offset..offset + row.len()` of every row of `out`, `[rows, stride]`. The other channels
 /// stay. Threads may divide the rows of `out`.
 ///
 /// # Panics
 /// If `row` does not fit into a row of `out`, or `out` is not whole rows.
-pub fn broadcast(row: &[f32], stride: usize, offset: usize, out: &mut [f32]) {
+pub fn broadcast<T: Copy>(row: &[T], stride: usize, offset: usize, out: &mut [T]) {
     assert!(stride > 0, "an extent is zero");
     assert!(offset <= stride && row.len() <= stride - offset, "the channels leave the row");
     assert!(out.len().is_multiple_of(stride), "the output is not whole rows");

@@ -12,9 +12,9 @@ use core::ops::Range;
 
 /// The arguments of an addition of an enlarged image.
 #[derive(Clone, Copy, Debug)]
-pub struct UpsampleAdd<'a> {
+pub struct UpsampleAdd<'a, T = f32> {
     /// The small image, `[low_height, low_width, channels]`.
-    pub low: &'a [f32],
+    pub low: &'a [T],
     /// Rows of the small image.
     pub low_height: usize,
     /// Columns of the small image.
@@ -27,8 +27,8 @@ pub struct UpsampleAdd<'a> {
     pub channels: usize,
 }
 
-impl UpsampleAdd<'_> {
-    fn check(&self, rows: &Range<usize>, out: &[f32]) {
+impl<T> UpsampleAdd<'_, T> {
+    pub(super) fn check(&self, rows: &Range<usize>, out: &[T]) {
         let extents = [self.low_height, self.low_width, self.height, self.width, self.channels];
         assert!(extents.iter().all(|&v| v > 0), "an extent is zero");
         assert_eq!(self.low.len(), self.low_height * self.low_width * self.channels, "the input has another shape");
@@ -38,7 +38,7 @@ impl UpsampleAdd<'_> {
 
     /// Where the small image's pixel for (`y`, `x`) starts.
     #[inline(always)]
-    fn offset(&self, y: usize, x: usize) -> usize {
+    pub(super) fn offset(&self, y: usize, x: usize) -> usize {
         (y * self.low_height / self.height * self.low_width + x * self.low_width / self.width) * self.channels
     }
 }
