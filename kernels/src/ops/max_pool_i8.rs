@@ -129,7 +129,7 @@ mod tests {
             -128, -120, -70, -60,
         ];
         for isa in Isa::available() {
-            assert_eq!(all(isa, &args(&input, [3, 4, 1], [3, 2, 1])), [-1, -3, -50, -5]);
+            assert_eq!(all(isa, &args(&input, [3, 4, 1], [3, 2, 1])), [-1, -2, -50, -5]);
             assert_eq!(all(isa, &args(&input, [3, 4, 1], [2, 1, 0])), [-1, -2, -3, -50, -5, -5]);
             assert_eq!(all(isa, &args(&[-128; 4], [2, 2, 1], [2, 2, 0])), [-128]);
         }

@@ -23,6 +23,27 @@ macro_rules! halves {
     };
 }
 
+// What takes more than an instruction or two is a function of its own: a closure has no instructions enabled, and what it
+// calls may stay a call.
+
+/// 2 to the power of each lane.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn exp2_int(n: __m256) -> __m256 {
+    let biased = _mm256_add_epi32(_mm256_cvtps_epi32(n), _mm256_set1_epi32(127));
+    _mm256_castsi256_ps(_mm256_slli_epi32::<23>(biased))
+}
+
+/// [`crate::quantised::requantise`], of products of 64 bits of the even lanes, and of the odd ones.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn requantise(sum: __m256i, multiplier: __m256i) -> __m256i {
+    let half = _mm256_set1_epi64x(1 << 31);
+    let odd = _mm256_mul_epi32(_mm256_srli_epi64::<32>(sum), _mm256_srli_epi64::<32>(multiplier));
+    let even = _mm256_srli_epi64::<32>(_mm256_add_epi64(_mm256_mul_epi32(sum, multiplier), half));
+    _mm256_blend_epi32::<0b1010_1010>(even, _mm256_add_epi64(odd, half))
+}
+
 impl Simd for Avx2 {
     type V = [__m256; 2];
     type I = [__m256i; 2];
@@ -130,11 +151,7 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn exp2_int(self, n: Self::V) -> Self::V {
-        // SAFETY: the token `self` proves that the CPU has AVX2.
-        n.map(|n| unsafe {
-            let biased = _mm256_add_epi32(_mm256_cvtps_epi32(n), _mm256_set1_epi32(127));
-            _mm256_castsi256_ps(_mm256_slli_epi32::<23>(biased))
-        })
+        halves!(exp2_int(n))
     }
     #[inline(always)]
     fn splat_int(self, x: u32) -> Self::I {
@@ -197,17 +214,7 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn requantise(self, sum: Self::I, multiplier: Self::I) -> Self::I {
-        // Products of 64 bits of the even lanes, and of the odd ones.
-        // SAFETY: the token `self` proves that the CPU has AVX2.
-        unsafe {
-            let half = _mm256_set1_epi64x(1 << 31);
-            [0, 1].map(|i| {
-                let odd = |x| _mm256_srli_epi64::<32>(x);
-                let even_product = _mm256_add_epi64(_mm256_mul_epi32(sum[i], multiplier[i]), half);
-                let odd_product = _mm256_add_epi64(_mm256_mul_epi32(odd(sum[i]), odd(multiplier[i])), half);
-                _mm256_blend_epi32::<0b1010_1010>(odd(even_product), odd_product)
-            })
-        }
+        halves!(requantise(sum, multiplier))
     }
     #[inline(always)]
     fn to_float(self, a: Self::I) -> Self::V {
