@@ -8,6 +8,9 @@ pub mod checkpoint;
 pub mod import;
 pub mod seeded;
 pub mod selftest;
+mod transform;
+
+pub use transform::use_winograd;
 
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::file::container::{Container, Data, Layout, Tensor};
@@ -102,7 +105,16 @@ impl Model {
             "kept" => Ok(false),
             other => Err(Error::format(format!("metadata key \"{key}\": found \"{other}\", expected folded or kept"))),
         };
-        let rewrites = Rewrites { batch_norm: flag("batch_norm")?, projection: flag("projection")? };
+        // A model without the key has direct sums.
+        let winograd = match container.metadata().get("winograd").map(String::as_str) {
+            None => false,
+            Some("used") => true,
+            Some(other) => {
+                let message = format!("metadata key \"winograd\": found \"{other}\", expected used or no such key");
+                return Err(Error::format(message));
+            }
+        };
+        let rewrites = Rewrites { batch_norm: flag("batch_norm")?, projection: flag("projection")?, winograd };
         if rewrites.projection && !rewrites.batch_norm {
             return Err(Error::format("the projection is folded but the batch norms are not"));
         }
@@ -297,13 +309,17 @@ pub fn write_bytes(path: &Path, bytes: &'static [u8]) -> Result<()> {
 /// A model file's metadata.
 pub(crate) fn metadata(network: &Network, options: Options) -> BTreeMap<String, String> {
     let flag = |folded: bool| if folded { "folded" } else { "kept" }.to_owned();
-    BTreeMap::from([
+    let mut metadata = BTreeMap::from([
         ("format".to_owned(), FORMAT.to_owned()),
         ("network".to_owned(), network.to_json()),
         ("precision".to_owned(), options.precision.name().to_owned()),
         ("batch_norm".to_owned(), flag(options.rewrites.batch_norm)),
         ("projection".to_owned(), flag(options.rewrites.projection)),
-    ])
+    ]);
+    if options.rewrites.winograd {
+        metadata.insert("winograd".to_owned(), "used".to_owned());
+    }
+    metadata
 }
 
 /// How model tensors lie in their file.
