@@ -4,7 +4,7 @@ use super::{ThreadCount, terminal};
 use clap::Args;
 use std::path::PathBuf;
 use voxcast::container::Container;
-use voxcast::graph::Results;
+use voxcast::graph::{Graph, Operation, Results};
 use voxcast::{Error, Model, Network, Result, Rig, Session, SessionOptions};
 
 /// Say what is in a model or a rig: shapes, precisions, sizes, the memory a session takes, checksum.
@@ -52,12 +52,14 @@ impl Inspect {
         let graph = model.graph(false, Results::default());
         let memory = Session::memory(&model, cameras, &options).map_err(|e| e.in_file(&self.file))?;
         let parameters: usize = model.tensors().map(|(_, _, len)| len).sum();
-        let multiply_adds: u64 = (0..graph.operations.len())
-            .map(|i| {
+        let work = |count: fn(&Graph, &Operation) -> u64| {
+            let of = |i: usize| {
                 let times = if i < graph.camera_operations { cameras as u64 } else { 1 };
-                graph.multiply_adds(&graph.operations[i]).saturating_mul(times)
-            })
-            .fold(0, u64::saturating_add);
+                count(&graph, &graph.operations[i]).saturating_mul(times)
+            };
+            (0..graph.operations.len()).map(of).fold(0, u64::saturating_add)
+        };
+        let (multiply_adds, executed) = (work(Graph::multiply_adds), work(Graph::executed_multiply_adds));
         let rewrites = model.options().rewrites;
         if self.json {
             let value = serde_json::json!({
@@ -66,6 +68,7 @@ impl Inspect {
                 "precision": model.options().precision.name(),
                 "batch_norm_folded": rewrites.batch_norm,
                 "projection_folded": rewrites.projection,
+                "winograd_used": rewrites.winograd,
                 "stored_numbers": parameters,
                 "file_bytes": model.file_size(),
                 "checksum": model.checksum().map(|c| format!("{c:016x}")),
@@ -75,6 +78,7 @@ impl Inspect {
                 "output_bytes": memory.output,
                 "session_bytes": memory.total(),
                 "multiply_adds": multiply_adds,
+                "executed_multiply_adds": executed,
             });
             println!("{value:#}");
             return Ok(());
@@ -83,16 +87,21 @@ impl Inspect {
         println!("model      {}", self.file.display());
         println!("checksum   {:016x}", model.checksum().unwrap_or_default());
         println!(
-            "weights    {} numbers, {} (batch norms {}, projection {})",
+            "weights    {} numbers, {} (batch norms {}, projection {}, {})",
             parameters,
             model.options().precision.name(),
             if rewrites.batch_norm { "folded" } else { "kept" },
-            if rewrites.projection { "folded" } else { "kept" }
+            if rewrites.projection { "folded" } else { "kept" },
+            if rewrites.winograd { "Winograd where it pays" } else { "direct sums" }
         );
         println!("file       {}", terminal::bytes(model.file_size()));
         println!("images     {} x {} (height x width, padded)", network.image[0], network.image[1]);
         println!("output     {x} x {y} x {z} voxels, {} classes", network.classes);
-        println!("work       {:.1} GMAC a frame of {cameras} cameras", multiply_adds as f64 / 1e9);
+        println!(
+            "work       {:.1} GMAC a frame of {cameras} cameras, of which {:.1} are executed",
+            multiply_adds as f64 / 1e9,
+            executed as f64 / 1e9
+        );
         println!(
             "session    {} bytes for {cameras} cameras and {} threads: arena {}, output {}",
             memory.total(),
@@ -105,12 +114,14 @@ impl Inspect {
             for (i, operation) in graph.operations.iter().enumerate() {
                 let tensor = graph.tensor(operation.result());
                 println!(
-                    "{:>4} {:60} {:?} x {:<5} {:>8.3} GMAC{}",
+                    "{:>4} {:60} {:17} {:?} x {:<5} {:>8.3} GMAC {:>8.3} executed{}",
                     i,
                     operation.name,
+                    operation.op.description().kind(),
                     tensor.extent,
                     tensor.channels,
                     graph.multiply_adds(operation) as f64 / 1e9,
+                    graph.executed_multiply_adds(operation) as f64 / 1e9,
                     if i < graph.camera_operations { " per camera" } else { "" }
                 );
             }

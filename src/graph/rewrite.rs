@@ -2,10 +2,11 @@
 
 use super::matrices::Matrix;
 use super::operation::{Graph, Operation};
-use super::ops::{BatchNorm, Conv, Gather, Op};
+use super::ops::{BatchNorm, Conv, Gather, Op, Winograd};
 use super::recipe::{ConvNames, Recipe};
 use super::tensor::TensorId;
 use voxcast_kernels::conv::Geometry;
+use voxcast_kernels::winograd::Shape;
 
 impl Graph {
     /// Moves every batch norm into the convolution whose result it reads: scale into the weights, shift into the bias.
@@ -55,6 +56,19 @@ impl Graph {
     pub fn fold_projection(mut self) -> Self {
         for level in 0..3 {
             self.fold_level(level);
+        }
+        self
+    }
+
+    /// Computes convolutions by Winograd's minimal filtering where [`Shape::best`] says so: from their shapes alone. What they
+    /// read and write, and all that surrounds them, stays. Nothing that folds convolutions may come after it.
+    #[must_use]
+    pub fn use_winograd(mut self) -> Self {
+        for operation in &mut self.operations {
+            let Op::Conv(Conv { geometry }) = operation.op else { continue };
+            if let Some(shape) = Shape::best(&geometry, operation.channels) {
+                operation.op = Winograd { geometry, shape }.into();
+            }
         }
         self
     }

@@ -15,7 +15,8 @@ impl Shape {
     ///
     /// Costs are counted in multiply-adds, from the shape alone: the sums, which take a quarter longer in groups and an eighth
     /// longer in a direct sum than the multiply-adds alone; both transforms, 14 per number; the weights, which are
-    /// read from far away, 8 per number. Winograd must save an eighth.
+    /// read from far away, 8 per number. Winograd must save an eighth, and its weights must not be larger than the maps
+    /// ([`Shape::modest`]).
     pub fn best(geometry: &Geometry, columns: usize) -> Option<Self> {
         let padded = columns.next_multiple_of(LANES) as u128;
         let products = geometry.depth() as u128 * padded;
@@ -23,7 +24,7 @@ impl Shape {
         [Scheme::Two, Scheme::Four]
             .into_iter()
             .filter_map(|scheme| Self::of(geometry, columns, scheme))
-            .filter(Self::accurate)
+            .filter(|shape| shape.accurate() && shape.modest())
             .map(|shape| (shape.cost(), shape))
             .min_by_key(|(cost, _)| *cost)
             .filter(|(cost, _)| *cost <= direct / 8 * 7)
@@ -43,6 +44,15 @@ impl Shape {
     pub fn accurate(&self) -> bool {
         self.scheme == Scheme::Two || self.depth() >= 32
     }
+
+    /// Whether the transformed weights, of which there are up to four times as many, take no more memory than the maps that
+    /// the convolution reads and writes: a network's memory follows its maps, and deep layers of small maps keep their
+    /// direct sums.
+    pub fn modest(&self) -> bool {
+        let maps = self.rows() as u128 * (self.channels + self.columns) as u128;
+        let per_point = self.depth() as u128 * self.columns.next_multiple_of(LANES) as u128;
+        self.scheme.points() as u128 * per_point <= maps
+    }
 }
 
 #[cfg(test)]
@@ -61,13 +71,16 @@ mod tests {
         for (input, kernel, channels, columns, want) in [
             ([1, 232, 400], plane, 64, 64, Some(Scheme::Four)),
             ([1, 58, 100], plane, 256, 27, Some(Scheme::Four)),
-            ([1, 29, 50], plane, 512, 512, Some(Scheme::Four)),
+            ([1, 58, 176], plane, 128, 128, Some(Scheme::Four)),
             ([1, 32, 88], plane, 32, 32, Some(Scheme::Four)),
             ([200, 200, 16], cube, 32, 32, Some(Scheme::Four)),
             ([104, 104, 8], cube, 16, 16, Some(Scheme::Four)),
-            ([13, 13, 1], cube, 64, 64, Some(Scheme::Four)),
-            // Few tiles: weights decide.
-            ([1, 4, 11], plane, 256, 256, Some(Scheme::Two)),
+            ([26, 26, 2], cube, 48, 48, Some(Scheme::Two)),
+            // Weights decide: those of F(4,3) would be larger than the maps, then those of F(2,3) too.
+            ([1, 16, 44], plane, 256, 27, Some(Scheme::Two)),
+            ([1, 29, 50], plane, 512, 512, None),
+            ([13, 13, 1], cube, 64, 64, None),
+            ([1, 4, 11], plane, 256, 256, None),
             ([1, 1, 1], plane, 256, 256, None),
             // Few channels: the transforms cost more than they save.
             ([1, 232, 400], plane, 16, 16, None),
