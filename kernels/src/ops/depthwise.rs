@@ -165,7 +165,7 @@ impl Depthwise<'_> {
                         for (i, sum) in sums.iter_mut().enumerate() {
                             let at = (kx + i) * self.channels;
                             let x = if WHOLE {
-                                // SAFETY: kx < kernel and i < N, so these 16 numbers end where the piece does, at most.
+                                // SAFETY: kx < kernel and i < N, so these 16 elements end where the piece does, at most.
                                 unsafe { s.load_ptr(piece.as_ptr().add(at)) }
                             } else {
                                 s.load_part(&piece[at..][..lanes])
