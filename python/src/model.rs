@@ -185,7 +185,7 @@ pub(crate) fn import_tensors(py: Python<'_>, tensors: &Bound<'_, PyDict>, wish: 
     let plan = wish.plan()?;
     let mut source = Tensors(HashMap::new());
     for (name, array) in tensors {
-        source.0.insert(name.extract()?, Numbers::of(&array)?);
+        source.0.insert(name.extract()?, Array::of(&array)?);
     }
     py.detach(|| plan.import(&source))
 }
@@ -239,10 +239,10 @@ impl Plan {
 }
 
 /// Weights from memory.
-struct Tensors(HashMap<String, Numbers>);
+struct Tensors(HashMap<String, Array>);
 
 /// An array in row-major order.
-struct Numbers {
+struct Array {
     shape: Vec<usize>,
     values: Values,
 }
@@ -252,7 +252,7 @@ enum Values {
     F64(Vec<f64>),
 }
 
-impl Numbers {
+impl Array {
     fn of(array: &Bound<'_, PyAny>) -> Outcome<Self> {
         if let Ok(array) = array.extract::<PyReadonlyArrayDyn<'_, f32>>() {
             let values = Values::F32(array.as_array().iter().copied().collect());

@@ -4,6 +4,7 @@
 //! frames but the index. Labels are classes of the network's training, [`IGNORED`] where there is no truth.
 
 mod arrays;
+mod kitti;
 mod named;
 pub mod nuscenes;
 pub mod occ3d_waymo;
@@ -51,6 +52,13 @@ pub struct Truth {
     pub grid_to_lidar: Pose,
 }
 
+impl Truth {
+    /// Labels without masks in the lidar's frame: the lidar is where its metres begin.
+    fn of_lidar(labels: Vec<u8>) -> Self {
+        Self { labels, masks: vec![], origins: vec![[0.0; 3]], grid_to_lidar: Pose::IDENTITY }
+    }
+}
+
 /// A frame: what a network gets, and what it should say.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
@@ -69,7 +77,9 @@ pub trait DataSet: Send + Sync {
     fn grid(&self) -> Grid;
 
     /// Names of the masks that every frame has: parts of the grid to be scored by themselves.
-    fn masks(&self) -> &[&'static str];
+    fn masks(&self) -> &[&'static str] {
+        &[]
+    }
 
     /// How the set's own evaluation counts, where that differs.
     fn published(&self) -> Option<Published> {

@@ -46,10 +46,6 @@ mod tests {
             Grid { size: [5, 1, 1], bounds: [[0.0, 5.0], [0.0, 1.0], [0.0, 1.0]], axes: Axes::Lidar }
         }
 
-        fn masks(&self) -> &[&'static str] {
-            &[]
-        }
-
         fn len(&self) -> usize {
             3
         }

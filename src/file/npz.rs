@@ -18,7 +18,7 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 pub enum Elements<'a> {
     /// Unsigned bytes, NumPy's `uint8`.
     U8(&'a [u8]),
-    /// Unsigned 16-bit numbers, NumPy's `uint16`.
+    /// Unsigned 16-bit integers, NumPy's `uint16`.
     U16(&'a [u16]),
     /// Single precision floats, NumPy's `float32`.
     F32(&'a [f32]),
@@ -40,7 +40,7 @@ pub struct Array<'a> {
 pub enum OwnedElements {
     /// Unsigned bytes.
     U8(Vec<u8>),
-    /// Unsigned 16-bit numbers.
+    /// Unsigned 16-bit integers.
     U16(Vec<u16>),
     /// Single precision floats, bit for bit as stored.
     F32(Vec<f32>),
@@ -147,19 +147,19 @@ fn write_array<W: Write + Seek>(zip: &mut ZipWriter<W>, array: &Array<'_>) -> io
     zip.write_all(&header)?;
     match array.elements {
         Elements::U8(v) => zip.write_all(v),
-        Elements::U16(v) => write_numbers(zip, v, |n| n.to_le_bytes()),
-        Elements::F32(v) => write_numbers(zip, v, |n| n.to_le_bytes()),
+        Elements::U16(v) => write_elements(zip, v, |n| n.to_le_bytes()),
+        Elements::F32(v) => write_elements(zip, v, |n| n.to_le_bytes()),
     }
 }
 
-/// Writes numbers through a small buffer, as the bytes that `bytes` makes of each.
-fn write_numbers<T: Copy, const N: usize>(
+/// Writes elements through a small buffer, as the bytes that `bytes` makes of each.
+fn write_elements<T: Copy, const N: usize>(
     out: &mut impl Write,
-    numbers: &[T],
+    elements: &[T],
     bytes: impl Fn(T) -> [u8; N],
 ) -> io::Result<()> {
     let mut buffer = Vec::with_capacity(1 << 16);
-    for part in numbers.chunks((1 << 16) / N) {
+    for part in elements.chunks((1 << 16) / N) {
         buffer.clear();
         buffer.extend(part.iter().flat_map(|&n| bytes(n)));
         out.write_all(&buffer)?;

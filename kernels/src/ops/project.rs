@@ -144,7 +144,7 @@ impl Kernel for Run<'_> {
 impl Run<'_> {
     #[inline(always)]
     fn all<S: Simd, const PAIRS: bool>(&mut self, s: S) {
-        let camera = Camera::<S>::new(s, self.p);
+        let camera = Constants::<S>::new(s, self.p);
         let plane = self.ys.len() * self.zs.len();
         let mut places = Places { ys: self.ys, zs: self.zs, z: 0 };
         for at in (0..plane).step_by(LANES) {
@@ -205,8 +205,8 @@ impl Places<'_> {
     }
 }
 
-/// What sixteen points share: the constants of a camera.
-struct Camera<'a, S: Simd> {
+/// What all points share: a camera, one constant for all lanes.
+struct Constants<'a, S: Simd> {
     matrix: &'a [f32; 12],
     last_column: S::V,
     last_row: S::V,
@@ -215,7 +215,7 @@ struct Camera<'a, S: Simd> {
     stride_log2: u32,
 }
 
-impl<'a, S: Simd> Camera<'a, S> {
+impl<'a, S: Simd> Constants<'a, S> {
     #[inline(always)]
     fn new(s: S, p: &'a Projection) -> Self {
         Self {

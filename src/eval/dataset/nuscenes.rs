@@ -85,12 +85,12 @@ struct Entry {
     /// File of the lidar's sweep.
     lidar: String,
     /// In the order of [`CAMERAS`].
-    cameras: Vec<Camera>,
+    cameras: Vec<CameraImage>,
     lidar_to_ego: Pose,
 }
 
 #[derive(Clone, Debug)]
-struct Camera {
+struct CameraImage {
     /// Its image, below the root.
     filename: String,
     /// Height and width.

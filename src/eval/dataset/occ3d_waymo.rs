@@ -6,7 +6,7 @@
 //! of the vehicle, which is the one in which Waymo gives its points and in which networks of it see.
 
 use super::arrays::Arrays;
-use super::semantickitti::{product, rows};
+use super::kitti::{product, rows};
 use super::{Axes, DataSet, Frame, Grid, Pose, Truth};
 use crate::base::error::{Error, Result};
 use crate::image::file::read_image;
