@@ -49,6 +49,13 @@ impl Geometry {
     }
 
     /// # Panics
+    /// If there is a third dimension.
+    pub(crate) fn check_flat(&self) {
+        let flat = [self.input[0], self.output[0], self.kernel[0]] == [1; 3] && self.padding[0] == 0;
+        assert!(flat, "a deformable convolution is two-dimensional");
+    }
+
+    /// # Panics
     /// If an extent is zero, a position cannot be counted, or `input` has another size.
     pub(crate) fn check<E>(&self, input: &[E]) {
         let extents = [self.input, self.kernel, self.stride, self.dilation];
