@@ -111,6 +111,7 @@ compile_error!(
 );
 
 pub mod base;
+pub mod calibrate;
 #[cfg(feature = "capi")]
 mod capi;
 pub mod check;

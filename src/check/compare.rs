@@ -126,6 +126,8 @@ pub struct Difference {
     pub max: f64,
     /// The same over the root mean square of the second dump's stage.
     pub relative: f64,
+    /// Signal to noise in decibels: the squares of the second dump's stage over those of the differences; none for integers.
+    pub snr: Option<f64>,
     /// Representable f32 numbers from one to the other, at most; none for integers.
     pub ulp: Option<u64>,
     /// The element with the largest difference, an index per axis, and both values.
@@ -197,8 +199,16 @@ pub fn compare(a: &Dump, b: &Dump, tolerance: Option<f64>, common: bool) -> Resu
 }
 
 fn difference(name: &str, shape: &[usize], a: &Values<'_>, b: &Values<'_>, tolerance: Option<f64>) -> Result<Outcome> {
-    let mut found =
-        Difference { count: 0, max: 0.0, relative: 0.0, ulp: None, at: Vec::new(), values: [0.0; 2], beyond: false };
+    let mut found = Difference {
+        count: 0,
+        max: 0.0,
+        relative: 0.0,
+        snr: None,
+        ulp: None,
+        at: Vec::new(),
+        values: [0.0; 2],
+        beyond: false,
+    };
     let mut worst = None;
     let mut see = |index: usize, x: f64, y: f64| {
         found.count += 1;
@@ -212,17 +222,19 @@ fn difference(name: &str, shape: &[usize], a: &Values<'_>, b: &Values<'_>, toler
     let len: usize = shape.iter().product();
     match (a, b) {
         (Values::Floats(a), Values::Floats(b)) => {
-            let (mut squares, mut ulp) = (0.0f64, 0u64);
+            let (mut squares, mut noise, mut ulp) = (0.0f64, 0.0f64, 0u64);
             let number = |bytes: &[u8; 4]| f32::from_le_bytes(*bytes);
             for (index, (x, y)) in a.as_chunks().0.iter().zip(b.as_chunks().0).enumerate() {
                 let (x, y) = (number(x), number(y));
                 squares += f64::from(y) * f64::from(y);
+                noise += (f64::from(x) - f64::from(y)).powi(2);
                 if x.to_bits() != y.to_bits() && !(x.is_nan() && y.is_nan()) {
                     ulp = ulp.max(rank(x).abs_diff(rank(y)));
                     see(index, f64::from(x), f64::from(y));
                 }
             }
             found.ulp = Some(ulp);
+            found.snr = Some(10.0 * (squares / noise).log10());
             found.relative = found.max / (squares / len.max(1) as f64).sqrt().max(f64::MIN_POSITIVE);
             found.beyond = tolerance.is_none_or(|t| found.relative.is_nan() || found.relative > t);
         }

@@ -21,7 +21,11 @@ Examples:
   voxcast compare stages/ expected.safetensors --tolerance 5e-3 --common
   voxcast compare a.npz b.npz
   voxcast compare --model f32.safetensors --against f16.safetensors scene/ --tolerance 0.05
+  voxcast compare --model int8.safetensors --against f32.safetensors scene/ --tolerance inf    (where does int8 lose?)
   voxcast compare --model model.safetensors --against-isa scalar scene/
+
+The column snr is the ratio of signal to noise of a stage in decibels, the second run being the signal. Stages of int8 models
+are compared as the numbers that their integers stand for.
 
 Exit codes: 0 they agree, 1 they differ (the first stage is named on stderr) or a file is at fault, 2 usage.")]
 pub struct Compare {
@@ -172,17 +176,18 @@ fn describe(stage: &Stage) -> String {
 fn print(stages: &[Stage]) {
     let first = stages.iter().position(Stage::diverges);
     println!(
-        "{:28} {:>10} {:>10} {:>9} {:>9} {:>10}  at: values",
-        "stage", "elements", "differing", "max", "over rms", "ulp"
+        "{:28} {:>10} {:>10} {:>9} {:>9} {:>7} {:>10}  at: values",
+        "stage", "elements", "differing", "max", "over rms", "snr dB", "ulp"
     );
     for (index, stage) in stages.iter().enumerate() {
         let mark = if first == Some(index) { "  <- first" } else { "" };
         match &stage.outcome {
             Outcome::Differs(d) => {
                 let ulp = d.ulp.map_or_else(|| "-".to_owned(), |ulp| ulp.to_string());
+                let snr = d.snr.map_or_else(|| "-".to_owned(), |snr| format!("{snr:.1}"));
                 let [x, y] = d.values;
                 println!(
-                    "{:28} {:>10} {:>10} {:>9.2e} {:>9.2e} {ulp:>10}  {:?}: {x} {y}{mark}",
+                    "{:28} {:>10} {:>10} {:>9.2e} {:>9.2e} {snr:>7} {ulp:>10}  {:?}: {x} {y}{mark}",
                     stage.name, stage.elements, d.count, d.max, d.relative, d.at
                 );
             }
@@ -205,6 +210,7 @@ fn json(stages: &[Stage]) -> serde_json::Value {
             value["differing"] = d.count.into();
             value["max"] = number(d.max);
             value["over_rms"] = number(d.relative);
+            value["snr_db"] = d.snr.map_or(serde_json::Value::Null, number);
             value["ulp"] = d.ulp.into();
             value["at"] = d.at.clone().into();
             value["values"] = d.values.map(number).to_vec().into();

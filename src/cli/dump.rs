@@ -2,9 +2,10 @@
 
 use safetensors::Dtype;
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::path::Path;
-use voxcast::container::{self, Data, Layout, Tensor};
-use voxcast::graph::{Elements, Graph, Results, Rewrites, Section, Space};
+use voxcast::container::{self, Data, Layout};
+use voxcast::graph::{Element, Elements, Graph, Results, Rewrites, Section, Space, Tensor};
 use voxcast::session::Event;
 use voxcast::{Error, ErrorKind, Network, Result, Rig};
 
@@ -74,8 +75,9 @@ impl Dump {
     pub fn observe(&mut self, graph: &Graph, event: &Event<'_>) {
         let names = [event.operation.stage.as_deref(), Some(event.operation.name.as_str())];
         let Some(name) = names.into_iter().flatten().find(|name| self.wants(name)) else { return };
-        let tensor = graph.tensor(event.operation.result());
-        let empty = || Stage { dtype: tensor.element.into(), shape: vec![], bytes: vec![] };
+        let operation = event.operation;
+        let tensor = graph.tensor(operation.result());
+        let empty = || Stage { dtype: dumped(tensor).into(), shape: vec![], bytes: vec![] };
         let stage = self.stages.entry(name.to_owned()).or_insert_with(empty);
         if tensor.section == Section::Head {
             // Channels last, as the result is.
@@ -88,8 +90,17 @@ impl Dump {
             Space::Volume => &tensor.extent[..],
             Space::Image | Space::Plane => &tensor.extent[1..],
         };
-        stage.shape = [batch, tensor.channels].into_iter().chain(extent.iter().copied()).collect();
-        stage.bytes.extend(channels_first(event.output, tensor.channels));
+        // What the operation has written: of branches side by side its own, of an 8-bit image three of four.
+        let channels = operation.first_channel..operation.first_channel + operation.channels;
+        stage.shape = [batch, channels.len()].into_iter().chain(extent.iter().copied()).collect();
+        match (event.output.get::<i8>(), tensor.scale) {
+            (Some(integers), Some(scale)) => {
+                let values: Vec<f32> = integers.iter().map(|&q| f32::from(q) * scale.step()).collect();
+                let elements = Elements::new(Element::F32, bytemuck::cast_slice(&values));
+                stage.bytes.extend(channels_first(elements, tensor.channels, channels));
+            }
+            _ => stage.bytes.extend(channels_first(event.output, tensor.channels, channels)),
+        }
     }
 
     /// Adds matrices and classes and writes all of it to `directory/stages.safetensors`.
@@ -109,7 +120,7 @@ impl Dump {
             self.stages.insert("classes".to_owned(), stage);
         }
         std::fs::create_dir_all(directory).map_err(|e| Error::io(directory, "create", &e))?;
-        let tensors = self.stages.iter().map(|(name, stage)| Tensor {
+        let tensors = self.stages.iter().map(|(name, stage)| container::Tensor {
             name: name.clone(),
             dtype: stage.dtype,
             shape: stage.shape.clone(),
@@ -119,14 +130,22 @@ impl Dump {
     }
 }
 
-/// The bytes of `[rows, channels]` as `[channels, rows]`.
-fn channels_first(elements: Elements<'_>, channels: usize) -> Vec<u8> {
+/// The type of the elements that stand for a tensor in a dump: 8-bit integers with a scale become the numbers that they
+/// stand for.
+fn dumped(tensor: &Tensor) -> Element {
+    if tensor.scale.is_some() { Element::F32 } else { tensor.element }
+}
+
+/// The bytes of some channels of `[rows, channels]` as `[channels, rows]`.
+fn channels_first(elements: Elements<'_>, channels: usize, wanted: Range<usize>) -> Vec<u8> {
     let size = elements.element().bytes();
     let rows = elements.len() / channels.max(1);
-    let mut out = vec![0; elements.bytes().len()];
-    for (i, element) in elements.bytes().chunks_exact(size).enumerate() {
-        let at = (i % channels * rows + i / channels) * size;
-        out[at..at + size].copy_from_slice(element);
+    let mut out = vec![0; rows * wanted.len() * size];
+    for (row, pixel) in elements.bytes().chunks_exact(channels * size).enumerate() {
+        for (channel, element) in pixel.chunks_exact(size).enumerate().filter(|(channel, _)| wanted.contains(channel)) {
+            let at = ((channel - wanted.start) * rows + row) * size;
+            out[at..at + size].copy_from_slice(element);
+        }
     }
     out
 }

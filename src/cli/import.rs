@@ -1,11 +1,16 @@
 //! `voxcast import`
 
-use super::{ThreadCount, terminal};
+use super::{ThreadCount, calibrate, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use voxcast::checkpoint::Checkpoint;
+use voxcast::container::Container;
 use voxcast::graph::Rewrites;
-use voxcast::model::{Model, Options};
+use voxcast::import::{Integers, Source};
+use voxcast::model::ranges::Ranges;
+use voxcast::model::unpacked::Unpacked;
+use voxcast::model::{FORMAT, Model, Options};
 use voxcast::network::BUILT_IN;
 use voxcast::weights::Precision;
 use voxcast::{Error, ErrorKind, Isa, Network, Note, Result};
@@ -17,20 +22,40 @@ use voxcast::{Error, ErrorKind, Isa, Network, Note, Result};
 Examples:
   voxcast import epoch_24.pth --network nuscenes-200 -o model.safetensors
   voxcast import weights.safetensors --network network.json --precision f16 -o model.safetensors
+  voxcast import epoch_24.pth --network nuscenes-200 --precision int8 --calibrate scenes/* -o int8.safetensors
+  voxcast import model.safetensors --precision int8 --calibrate synthetic:train -o int8.safetensors
+  voxcast import model.safetensors --precision int8 --ranges ranges.json --keep-f32 img_backbone.layer1 -o int8.safetensors
 
 A .pth file, of either format that torch.save writes, is read without executing anything: it may hold tensors and plain
 containers, and whatever else its pickle wants to call is refused by name. What wrappers put in front of names (module.,
 _orig_mod., model.) is taken off, name by name. Notes on standard error say which state was taken of several, and which
-tensors the network does not have.")]
+tensors the network does not have.
+
+int8 needs the range of every tensor: measured here (--calibrate), or by voxcast calibrate (--ranges). docs/int8.md says which
+operations stay in f32 and how to find the ones that lose most.")]
 pub struct Import {
-    /// mmengine .pth, or .safetensors with the same names
+    /// mmengine .pth, .safetensors with the same names, or a model of f32 or f16
     checkpoint: PathBuf,
-    /// nuscenes-200, nuscenes-256, semantickitti-256, edge, or a network.json
+    /// nuscenes-200, nuscenes-256, semantickitti-256, edge, or a network.json [default: that of a model]
     #[arg(long, value_name = "NAME|FILE.json")]
-    network: String,
-    /// How weights are stored; arithmetic is f32 either way
-    #[arg(long, default_value = "f32", value_parser = ["f32", "f16"])]
+    network: Option<String>,
+    /// How weights are stored; arithmetic is in integers for int8, else f32
+    #[arg(long, default_value = "f32", value_parser = ["f32", "f16", "int8", "i8"], hide_possible_values = true,
+        value_name = "f32|f16|int8")]
     precision: String,
+    /// Scenes and data sets to measure ranges on, for int8: directories, .safetensors files, synthetic:DIR and others
+    #[arg(long, value_name = "SCENE", num_args = 1.., conflicts_with = "ranges")]
+    calibrate: Vec<String>,
+    /// Frames to measure ranges on, at most, spread over all that are given
+    #[arg(long, value_name = "N", default_value_t = calibrate::FRAMES, requires = "calibrate",
+        value_parser = clap::value_parser!(u32).range(1..))]
+    calibrate_frames: u32,
+    /// Ranges that voxcast calibrate has measured, for int8
+    #[arg(long, value_name = "RANGES.json")]
+    ranges: Option<PathBuf>,
+    /// Operations of an int8 model that stay in f32: names, or the start of names up to a dot
+    #[arg(long, value_name = "NAME", value_delimiter = ',')]
+    keep_f32: Vec<String>,
     /// Rewrites applied to the network: all, batch-norm (keeps the pyramid's features), none (keeps batch norms too)
     #[arg(long, default_value = "all", value_parser = ["all", "batch-norm", "none"])]
     fold: String,
@@ -46,21 +71,79 @@ pub struct Import {
 
 impl Import {
     pub fn run(self) -> Result<()> {
-        let network = read_network(&self.network)?;
-        let rewrites = match self.fold.as_str() {
+        let precision = Precision::parse(&self.precision).unwrap_or(Precision::F32);
+        self.check_usage(precision);
+        match self.model()? {
+            Some(model) => {
+                let network = self.network.as_deref().map(read_network).transpose()?;
+                if network.is_some_and(|network| network != *model.network()) {
+                    return Err(Error::mismatch("--network is not the model's").in_file(&self.checkpoint));
+                }
+                let source = Unpacked::new(&model).map_err(|e| e.in_file(&self.checkpoint))?;
+                self.convert(&source, model.network(), precision, vec![])
+            }
+            None => {
+                let Some(network) = &self.network else { return usage("--network, unless the checkpoint is a model") };
+                let network = read_network(network)?;
+                let checkpoint = Checkpoint::open(&self.checkpoint)?;
+                self.convert(&checkpoint, &network, precision, checkpoint.notes())?;
+                let unused = unused(&checkpoint).map(|note| note.in_file(&self.checkpoint));
+                terminal::say(&Vec::from_iter(unused));
+                Ok(())
+            }
+        }
+    }
+
+    /// Refuses arguments that do not go with the precision.
+    fn check_usage(&self, precision: Precision) {
+        let ranges = self.ranges.is_some() || !self.calibrate.is_empty();
+        let _ = match precision {
+            Precision::I8 if !ranges => usage("--calibrate SCENE... or --ranges FILE with --precision int8"),
+            Precision::I8 if self.fold == "none" => usage("--fold all or batch-norm with --precision int8"),
+            Precision::F32 | Precision::F16 if ranges => usage("--precision int8 with --calibrate or --ranges"),
+            Precision::F32 | Precision::F16 if !self.keep_f32.is_empty() => usage("--precision int8 with --keep-f32"),
+            _ => Ok(()),
+        };
+    }
+
+    /// The checkpoint as a model, if it is one.
+    fn model(&self) -> Result<Option<Model>> {
+        let container = Container::open(&self.checkpoint).ok();
+        let is_model = container.is_some_and(|c| c.metadata().get("format").is_some_and(|format| format == FORMAT));
+        is_model.then(|| Model::open(&self.checkpoint)).transpose()
+    }
+
+    fn rewrites(&self) -> Rewrites {
+        match self.fold.as_str() {
             "all" => Rewrites::ALL,
             "none" => Rewrites::NONE,
             _ => Rewrites { projection: false, ..Rewrites::ALL },
-        };
-        let precision = Precision::parse(&self.precision).unwrap_or(Precision::F32);
-        let checkpoint = Checkpoint::open(&self.checkpoint)?;
+        }
+    }
+
+    fn convert(&self, source: &dyn Source, network: &Network, precision: Precision, notes: Vec<Note>) -> Result<()> {
+        let in_checkpoint = |e: Error| e.in_file(&self.checkpoint);
+        let rewrites = self.rewrites();
         let bar = terminal::progress("importing", 0);
-        let options = Options { precision, rewrites };
-        voxcast::import::import(&checkpoint, &network, options, &self.output, &mut |done, total| {
+        let progress = &mut |done, total| {
             bar.set_length(total as u64);
             bar.set_position(done as u64);
-        })
-        .map_err(|e| e.in_file(&self.checkpoint))?;
+        };
+        let ranges = match precision {
+            Precision::I8 => Some(self.ranges(source, network, rewrites)?),
+            Precision::F32 | Precision::F16 => None,
+        };
+        match &ranges {
+            None => {
+                let options = Options { precision, rewrites };
+                voxcast::import::import(source, network, options, &self.output, progress)
+            }
+            Some(ranges) => {
+                let integers = Integers { rewrites, ranges, keep_f32: &self.keep_f32 };
+                voxcast::import::import_int8(source, network, &integers, &self.output, progress)
+            }
+        }
+        .map_err(in_checkpoint)?;
         if !self.no_self_test {
             bar.set_message("self-test");
             let hint = |e: Error| {
@@ -71,8 +154,7 @@ impl Import {
             voxcast::selftest::record(&self.output, Isa::best(), &self.threads.threads()?).map_err(hint)?;
         }
         bar.finish_and_clear();
-        terminal::say(&checkpoint.notes());
-        terminal::say(&Vec::from_iter(unused(&checkpoint).map(|note| note.in_file(&self.checkpoint))));
+        terminal::say(&notes);
         let model = Model::open(&self.output)?;
         println!(
             "{}: {} weights, {}, checksum {:016x}",
@@ -83,6 +165,29 @@ impl Import {
         );
         Ok(())
     }
+
+    /// The ranges from their file, or measured with the weights in f32.
+    fn ranges(&self, source: &dyn Source, network: &Network, rewrites: Rewrites) -> Result<Ranges> {
+        if let Some(path) = &self.ranges {
+            return Ranges::open(path, network);
+        }
+        let bar = terminal::progress("folding", 0);
+        let options = Options { precision: Precision::F32, rewrites };
+        let bytes = voxcast::import::import_to_bytes(source, network, options, &mut |done, total| {
+            bar.set_length(total as u64);
+            bar.set_position(done as u64);
+        });
+        bar.finish_and_clear();
+        let model = Arc::new(Model::from_bytes(bytes.map_err(|e| e.in_file(&self.checkpoint))?)?);
+        calibrate::measure(&model, &self.calibrate, self.calibrate_frames, (Isa::best(), self.threads.threads()?))
+    }
+}
+
+/// Ends the program as clap does where it finds arguments wrong.
+fn usage(expected: &str) -> Result<()> {
+    use clap::CommandFactory;
+    let message = format!("expected {expected}");
+    super::Arguments::command().error(clap::error::ErrorKind::ArgumentConflict, message).exit()
 }
 
 /// Ends of names that training keeps for itself: counters of batch norms and of moving averages.

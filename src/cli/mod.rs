@@ -1,5 +1,6 @@
 //! Arguments and commands. One file per command under `cli/`.
 
+mod calibrate;
 mod compare;
 mod demo;
 mod dump;
@@ -51,6 +52,8 @@ enum Command {
     Demo(demo::Demo),
     /// Turn a training checkpoint into a model
     Import(import::Import),
+    /// Measure the ranges of a model's tensors on scenes, for int8
+    Calibrate(calibrate::Calibrate),
     /// Build the projection matrices of a scene's cameras
     Rig(rig::BuildRig),
     /// Run a model on a scene
@@ -76,6 +79,7 @@ impl Arguments {
         match self.command {
             Command::Demo(command) => command.run(),
             Command::Import(command) => command.run(),
+            Command::Calibrate(command) => command.run(),
             Command::Rig(command) => command.run(),
             Command::Run(command) => command.run(),
             Command::View(command) => command.run(),

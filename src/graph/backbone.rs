@@ -13,6 +13,7 @@ pub(super) fn build(b: &mut Builder, network: &Network) -> [TensorId; 3] {
     let bgr = b.add(Tensor {
         name: "image.bgr".to_owned(),
         element: Element::U8,
+        scale: None,
         space: Space::Image,
         section: Section::Stem,
         scope: Scope::Input,

@@ -99,7 +99,17 @@ impl Builder {
     /// A tensor of f32 that lies between operations.
     pub(super) fn tensor(&mut self, name: &str, space: Space, extent: [usize; 3], channels: usize) -> TensorId {
         let (element, section, scope, lifetime) = (Element::F32, self.section, Scope::Inner, self.lifetime);
-        self.add(Tensor { name: name.to_owned(), element, space, section, scope, lifetime, extent, channels })
+        self.add(Tensor {
+            name: name.to_owned(),
+            element,
+            scale: None,
+            space,
+            section,
+            scope,
+            lifetime,
+            extent,
+            channels,
+        })
     }
 
     pub(super) fn add(&mut self, tensor: Tensor) -> TensorId {

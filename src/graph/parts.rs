@@ -5,32 +5,42 @@
 
 use super::element::Element;
 
-/// How large weights are stored. Arithmetic is f32 either way.
+/// How large weights are stored, and in what is computed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Precision {
     /// Single precision.
     F32,
-    /// Half precision: half the file, half the memory, exact widening.
+    /// Half precision: half the file, half the memory, exact widening. Arithmetic is f32.
     F16,
+    /// Signed bytes, summed exactly in integers. Operations that stay in floating point store single precision.
+    I8,
 }
 
 impl Precision {
-    /// `f32` or `f16`.
+    /// All of them.
+    pub const ALL: [Self; 3] = [Precision::F32, Precision::F16, Precision::I8];
+
+    /// `f32`, `f16` or `int8`.
     pub fn name(self) -> &'static str {
-        self.element().name()
+        match self {
+            Precision::F32 => "f32",
+            Precision::F16 => "f16",
+            Precision::I8 => "int8",
+        }
     }
 
-    /// The type of an element.
+    /// The type in which large weights of floating-point operations are stored.
     pub fn element(self) -> Element {
         match self {
-            Precision::F32 => Element::F32,
+            Precision::F32 | Precision::I8 => Element::F32,
             Precision::F16 => Element::F16,
         }
     }
 
-    /// The precision of that name.
+    /// The precision of that name; `i8` is taken for `int8`.
     pub fn parse(name: &str) -> Option<Self> {
-        [Precision::F32, Precision::F16].into_iter().find(|p| p.name() == name)
+        let name = if name == "i8" { "int8" } else { name };
+        Self::ALL.into_iter().find(|p| p.name() == name)
     }
 }
 
@@ -60,6 +70,11 @@ impl Part {
         Self { suffix, len, storage: Storage::Model }
     }
 
+    /// Integers, or another type that no model stores otherwise.
+    pub fn of(element: Element, suffix: &'static str, len: usize) -> Self {
+        Self { suffix, len, storage: Storage::Always(element) }
+    }
+
     /// f32 in every model.
     pub fn plain(suffix: &'static str, len: usize) -> Self {
         Self { suffix, len, storage: Storage::Always(Element::F32) }
@@ -80,7 +95,7 @@ impl Part {
 }
 
 /// No operation has more parts.
-pub const MAX_PARTS: usize = 7;
+pub const MAX_PARTS: usize = 16;
 
 #[cfg(test)]
 mod tests {
@@ -88,9 +103,10 @@ mod tests {
 
     #[test]
     fn precisions_have_names() {
-        for precision in [Precision::F32, Precision::F16] {
+        for precision in Precision::ALL {
             assert_eq!(Precision::parse(precision.name()), Some(precision));
         }
+        assert_eq!(Precision::parse("i8"), Some(Precision::I8));
         assert_eq!(Precision::parse("F32"), None);
     }
 
@@ -99,7 +115,7 @@ mod tests {
         let stored = |part: &Part| [Precision::F32, Precision::F16].map(|p| (part.element(p), part.stored_len(p)));
         assert_eq!(stored(&Part::plain("bias", 17)), [(Element::F32, 32); 2]);
         assert_eq!(stored(&Part::panels("weight", 17)), [(Element::F32, 32), (Element::F16, 32)]);
-        let scales = Part { suffix: "scale", len: 17, storage: Storage::Always(Element::I8) };
+        let scales = Part::of(Element::I8, "scale", 17);
         assert_eq!(stored(&scales), [(Element::I8, 64); 2]);
         assert_eq!(Part::panels("weight", 64).stored_len(Precision::F16), 64);
     }

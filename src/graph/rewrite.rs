@@ -25,6 +25,11 @@ impl Graph {
                     if let (Recipe::Conv(names), Recipe::Module(norm)) = (&mut producer.recipe, operation.recipe) {
                         names.norm = Some(norm);
                     }
+                    for &TensorId(output) in &operation.outputs {
+                        if self.tensors[output].name == operation.name {
+                            self.tensors[output].name.clone_from(&producer.name);
+                        }
+                    }
                     producer.outputs = operation.outputs;
                     producer.relu = operation.relu;
                     producer.residual = operation.residual;

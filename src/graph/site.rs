@@ -49,6 +49,11 @@ impl<'a> Site<'a> {
         &self.tensors[self.outputs[0].0]
     }
 
+    /// The tensor that is added, if there is one.
+    pub fn added(&self) -> Option<&'a Tensor> {
+        self.residual.map(|residual| &self.tensors[residual.tensor.0])
+    }
+
     /// Positions of the output.
     pub fn rows(&self) -> usize {
         self.output().rows()

@@ -1,6 +1,7 @@
 //! Tensors: what lies between operations.
 
 use super::element::Element;
+use super::scale::Scale;
 use std::fmt;
 
 /// A tensor of a [`Graph`](super::Graph), by position in its list.
@@ -93,6 +94,8 @@ pub struct Tensor {
     pub name: String,
     /// Type of its elements.
     pub element: Element,
+    /// What one step of an `i8` element stands for; none for other types.
+    pub scale: Option<Scale>,
     /// What its positions are.
     pub space: Space,
     /// The part of the network that it belongs to.

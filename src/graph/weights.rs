@@ -6,7 +6,7 @@ use voxcast_kernels::LANES;
 use voxcast_kernels::panels::{packed_index, packed_len};
 
 /// Added to a batch norm's variance (the published networks' value).
-const EPSILON: f64 = 1e-5;
+pub(crate) const EPSILON: f64 = 1e-5;
 
 /// Where weights come from, by the names of published checkpoints.
 pub trait Source {

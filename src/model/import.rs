@@ -6,14 +6,14 @@ use crate::base::error::{Error, ErrorKind, Result};
 use crate::file::container::{self, Data, Tensor};
 use crate::graph::parts::{Part, Precision};
 use crate::graph::weights::{Values, Weights};
-use crate::graph::{Element, Graph, Operation};
+use crate::graph::{Element, Graph, Operation, Rewrites};
 #[cfg(feature = "import")]
 use crate::model::checkpoint::Checkpoint;
-use crate::model::{self, Options, parts};
+use crate::model::ranges::Ranges;
+use crate::model::{self, Form, Options, parts};
 use crate::network::Network;
 use half::f16;
 use std::cell::RefCell;
-use std::collections::BTreeSet;
 use std::path::Path;
 
 #[cfg(feature = "import")]
@@ -66,8 +66,8 @@ fn check_offsets(checkpoint: &Checkpoint, name: &str, biases: &[usize]) -> Resul
     Ok(())
 }
 
-/// Makes a model of the weights that `source` has and writes it to `path`, by way of a temporary file beside it. `progress` is told how
-/// many of how many tensors are done.
+/// Makes a model in floating point of the weights that `source` has and writes it to `path`, by way of a temporary file
+/// beside it. `progress` is told how many of how many tensors are done.
 ///
 /// # Errors
 /// A tensor that is missing, has another shape, or holds a number that is not finite, by name; failed writes.
@@ -78,11 +78,10 @@ pub fn import(
     path: &Path,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<()> {
-    let list = Conversion::new(source, network, options)?;
-    container::write(path, list.tensors(progress), &model::metadata(network, options), model::LAYOUT)
+    Conversion::new(source, Form::floating(network, options)?)?.write(path, progress)
 }
 
-/// Makes a model of the weights that `source` has, in memory: the bytes that [`import`] would write.
+/// Makes a model in floating point of the weights that `source` has, in memory: the bytes that [`import`] would write.
 ///
 /// # Errors
 /// Those of [`import`] that are not about the file; [`ErrorKind::TooLarge`] if the system has no memory for it.
@@ -92,37 +91,84 @@ pub fn import_to_bytes(
     options: Options,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<u8>> {
-    let list = Conversion::new(source, network, options)?;
-    container::to_bytes(list.tensors(progress), &model::metadata(network, options), model::LAYOUT)
+    Conversion::new(source, Form::floating(network, options)?)?.bytes(progress)
+}
+
+/// How a model of 8-bit integers is made.
+#[derive(Clone, Debug)]
+pub struct Integers<'a> {
+    /// Which rewrites come first. Batch norms are folded.
+    pub rewrites: Rewrites,
+    /// The ranges of the network's tensors.
+    pub ranges: &'a Ranges,
+    /// Operations that stay in floating point, by name, or by the start of names up to a dot.
+    pub keep_f32: &'a [String],
+}
+
+impl Integers<'_> {
+    fn form(&self, network: &Network) -> Result<Form> {
+        let scale = |name: &str| self.ranges.scale(name);
+        let quantisation = model::quantisation(network, self.rewrites, self.keep_f32, &scale)?;
+        Form::integers(network, self.rewrites, quantisation)
+    }
+}
+
+/// [`import`] to a model of 8-bit integers.
+///
+/// # Errors
+/// As [`import`]; a tensor whose range is missing, zero or underflows, by name; an operation to be kept that the network
+/// does not have, or whose weights do not go with the ranges.
+pub fn import_int8(
+    source: &dyn Source,
+    network: &Network,
+    integers: &Integers<'_>,
+    path: &Path,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<()> {
+    Conversion::new(source, integers.form(network)?)?.write(path, progress)
+}
+
+/// [`import_to_bytes`] to a model of 8-bit integers.
+///
+/// # Errors
+/// Those of [`import_int8`] that are not about the file; [`ErrorKind::TooLarge`] if the system has no memory for it.
+pub fn import_int8_to_bytes(
+    source: &dyn Source,
+    network: &Network,
+    integers: &Integers<'_>,
+    progress: &mut dyn FnMut(usize, usize),
+) -> Result<Vec<u8>> {
+    Conversion::new(source, integers.form(network)?)?.bytes(progress)
 }
 
 /// Everything that goes into a model, in file order.
 struct Conversion<'a> {
     source: &'a dyn Source,
+    form: Form,
     graphs: Vec<Graph>,
     /// Graph and operation of each operation that stores something.
     operations: Vec<(usize, usize)>,
-    precision: Precision,
     /// The values of the operation whose parts are being written.
     current: RefCell<(usize, Vec<Values>)>,
 }
 
 impl<'a> Conversion<'a> {
-    fn new(source: &'a dyn Source, network: &Network, options: Options) -> Result<Self> {
-        network.check()?;
-        model::check_options(options)?;
-        let graphs = model::graphs(network, options.rewrites);
-        let mut seen = BTreeSet::new();
-        let mut operations = vec![];
-        for (g, graph) in graphs.iter().enumerate() {
-            for (o, operation) in graph.operations.iter().enumerate() {
-                if seen.insert(operation.name.clone()) && !parts(graph, operation).is_empty() {
-                    operations.push((g, o));
-                }
-            }
-        }
-        let current = RefCell::new((usize::MAX, vec![]));
-        Ok(Self { source, graphs, operations, precision: options.precision, current })
+    fn new(source: &'a dyn Source, form: Form) -> Result<Self> {
+        let graphs = form.graphs()?;
+        let operations = model::stored(&graphs);
+        Ok(Self { source, form, graphs, operations, current: RefCell::new((usize::MAX, vec![])) })
+    }
+
+    fn write(&self, path: &Path, progress: &mut dyn FnMut(usize, usize)) -> Result<()> {
+        container::write(path, self.tensors(progress), &self.form.metadata(), model::LAYOUT)
+    }
+
+    fn bytes(&self, progress: &mut dyn FnMut(usize, usize)) -> Result<Vec<u8>> {
+        container::to_bytes(self.tensors(progress), &self.form.metadata(), model::LAYOUT)
+    }
+
+    fn precision(&self) -> Precision {
+        self.form.options.precision
     }
 
     fn operation(&self, index: usize) -> (&Graph, &Operation) {
@@ -148,7 +194,7 @@ impl<'a> Conversion<'a> {
                     }
                     self.part(index, i, &label, &stored)
                 };
-                tensors.push(model::tensor(name, &part, self.precision, Data::Make(Box::new(make))));
+                tensors.push(model::tensor(name, &part, self.precision(), Data::Make(Box::new(make))));
             }
         }
         tensors
@@ -160,9 +206,16 @@ impl<'a> Conversion<'a> {
         if current.0 != index {
             let (graph, operation) = self.operation(index);
             let weights = Weights(self.source);
-            *current = (index, operation.op.description().evaluate(&graph.site(operation), &weights)?);
+            let evaluated = operation.op.description().evaluate(&graph.site(operation), &weights);
+            let of_operation = |e: Error| match e.kind() {
+                ErrorKind::Unsupported => {
+                    Error::new(e.kind(), format!("operation \"{}\": {}", operation.name, e.message()))
+                }
+                _ => e,
+            };
+            *current = (index, evaluated.map_err(of_operation)?);
         }
-        encode(name, part, &current.1[i], self.precision)
+        encode(name, part, &current.1[i], self.precision())
     }
 }
 

@@ -5,18 +5,22 @@
 
 #[cfg(feature = "import")]
 pub mod checkpoint;
+mod form;
 pub mod import;
+pub mod ranges;
 pub mod seeded;
 pub mod selftest;
+pub mod unpacked;
 
-use crate::base::error::{Error, ErrorKind, Result};
+use crate::base::error::{Error, Result};
 use crate::file::container::{Container, Data, Layout, Tensor};
 use crate::graph::parts::{Part, Precision};
-use crate::graph::{Element, Elements, Graph, Operation, Results, Rewrites};
+use crate::graph::{Element, Elements, Graph, Operation, Quantisation, Results, Rewrites};
+pub(crate) use crate::model::form::{Form, parts, quantisation, stored};
 use crate::model::selftest::SelfTest;
 use crate::network::Network;
 use safetensors::Dtype;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Value of the metadata key `format`.
@@ -42,8 +46,7 @@ impl Default for Options {
 #[derive(Debug)]
 pub struct Model {
     container: Container,
-    network: Network,
-    options: Options,
+    form: Form,
     path: Option<PathBuf>,
 }
 
@@ -83,38 +86,27 @@ impl Model {
     }
 
     fn new(container: Container) -> Result<Self> {
-        let get = |key: &str| {
-            container.metadata().get(key).map(String::as_str).ok_or_else(|| {
-                Error::format(format!("the metadata key \"{key}\" is missing, expected a voxcast model"))
-            })
-        };
-        let format = get("format")?;
-        if format != FORMAT {
-            return Err(Error::format(format!("metadata key \"format\": found \"{format}\", expected \"{FORMAT}\"")));
-        }
-        let network = Network::from_json(get("network")?)?;
-        let precision = get("precision")?;
-        let precision = Precision::parse(precision).ok_or_else(|| {
-            Error::format(format!("metadata key \"precision\": found \"{precision}\", expected f32 or f16"))
-        })?;
-        let flag = |key: &str| match get(key)? {
-            "folded" => Ok(true),
-            "kept" => Ok(false),
-            other => Err(Error::format(format!("metadata key \"{key}\": found \"{other}\", expected folded or kept"))),
-        };
-        let rewrites = Rewrites { batch_norm: flag("batch_norm")?, projection: flag("projection")? };
-        if rewrites.projection && !rewrites.batch_norm {
-            return Err(Error::format("the projection is folded but the batch norms are not"));
-        }
-        let model = Self { container, network, options: Options { precision, rewrites }, path: None };
-        for (name, part) in stored_parts(&model.network, rewrites) {
-            model.check(&name, &part)?;
+        let form = Form::read(container.metadata())?;
+        let model = Self { container, form, path: None };
+        for graph in model.form.graphs()? {
+            model.check_graph(&graph)?;
         }
         Ok(model)
     }
 
+    /// Checks that everything that `graph` stores is there, and is what kernels take for granted.
+    fn check_graph(&self, graph: &Graph) -> Result<()> {
+        for operation in &graph.operations {
+            let refs = self.part_refs(graph, operation)?;
+            let parts: Vec<Elements<'_>> = refs.iter().map(|part| self.resolve(part)).collect();
+            let bad = |e: String| Error::format(format!("operation \"{}\": {e}", operation.name));
+            operation.op.description().verify(&graph.site(operation), &parts).map_err(bad)?;
+        }
+        Ok(())
+    }
+
     fn check(&self, name: &str, part: &Part) -> Result<()> {
-        let precision = self.options.precision;
+        let precision = self.form.options.precision;
         let Some((dtype, shape, _)) = self.container.tensor(name) else {
             return Err(Error::format(format!("tensor \"{name}\" is missing")));
         };
@@ -130,7 +122,7 @@ impl Model {
 
     /// The bytes of a stored part, without the padding after it.
     fn part(&self, name: &str, part: &Part) -> Result<&[u8]> {
-        let size = part.element(self.options.precision).bytes();
+        let size = part.element(self.form.options.precision).bytes();
         let bytes = self.container.tensor(name).map(|(_, _, bytes)| bytes);
         bytes
             .filter(|bytes| (bytes.as_ptr() as usize).is_multiple_of(size))
@@ -140,12 +132,17 @@ impl Model {
 
     /// The network.
     pub fn network(&self) -> &Network {
-        &self.network
+        &self.form.network
     }
 
     /// How it is stored.
     pub fn options(&self) -> Options {
-        self.options
+        self.form.options
+    }
+
+    /// What makes its graph one of 8-bit integers; none for floating point.
+    pub fn quantisation(&self) -> Option<&Quantisation> {
+        self.form.quantisation.as_ref()
     }
 
     /// The file it was opened from.
@@ -217,11 +214,11 @@ impl Model {
         })
     }
 
-    /// The graph that runs: every rewrite the model has weights for, or, with `unfolded`, without the projection fold.
+    /// The graph that runs: every rewrite the model has weights for, or, with `unfolded`, without the projection fold. A
+    /// model of int8 has no other graph than the one that runs.
     pub fn graph(&self, unfolded: bool, results: Results) -> Graph {
-        let rewrites = self.options.rewrites;
-        Graph::build(&self.network, results)
-            .rewritten(Rewrites { projection: rewrites.projection && !unfolded, ..rewrites })
+        let graph = self.form.graph(unfolded, results);
+        graph.unwrap_or_else(|e| unreachable!("opening the model has built all of its graphs: {e}"))
     }
 
     /// Where the stored parts of `operation` lie, in the order of its description.
@@ -237,7 +234,7 @@ impl Model {
                 self.check(&name, part)?;
                 let bytes = self.part(&name, part)?;
                 let start = bytes.as_ptr() as usize - data.as_ptr() as usize;
-                Ok(PartRef { bytes: start..start + bytes.len(), element: part.element(self.options.precision) })
+                Ok(PartRef { bytes: start..start + bytes.len(), element: part.element(self.form.options.precision) })
             })
             .collect()
     }
@@ -255,32 +252,6 @@ pub(crate) struct PartRef {
     element: Element,
 }
 
-/// What `operation` stores.
-pub(crate) fn parts(graph: &Graph, operation: &Operation) -> Vec<Part> {
-    operation.op.description().parts(&graph.site(operation))
-}
-
-/// The graphs that a model of these rewrites can run, the fastest first.
-pub(crate) fn graphs(network: &Network, rewrites: Rewrites) -> Vec<Graph> {
-    let mut graphs = vec![Graph::build(network, Results::ALL).rewritten(rewrites)];
-    if rewrites.projection {
-        graphs.push(Graph::build(network, Results::ALL).rewritten(Rewrites { projection: false, ..rewrites }));
-    }
-    graphs
-}
-
-/// Full name and part of everything a model stores, in file order.
-pub(crate) fn stored_parts(network: &Network, rewrites: Rewrites) -> Vec<(String, Part)> {
-    let mut seen = BTreeSet::new();
-    let mut list = vec![];
-    for graph in graphs(network, rewrites) {
-        for operation in graph.operations.iter().filter(|o| seen.insert(o.name.clone())) {
-            list.extend(parts(&graph, operation).into_iter().map(|p| (format!("{}.{}", operation.name, p.suffix), p)));
-        }
-    }
-    list
-}
-
 /// A stored tensor, to be written.
 pub(crate) fn tensor<'a>(name: String, part: &Part, precision: Precision, data: Data<'a>) -> Tensor<'a> {
     Tensor { name, dtype: Dtype::from(part.element(precision)), shape: vec![part.stored_len(precision)], data }
@@ -294,28 +265,8 @@ pub fn write_bytes(path: &Path, bytes: &'static [u8]) -> Result<()> {
     Model::from_bytes(bytes)?.save(path)
 }
 
-/// A model file's metadata.
-pub(crate) fn metadata(network: &Network, options: Options) -> BTreeMap<String, String> {
-    let flag = |folded: bool| if folded { "folded" } else { "kept" }.to_owned();
-    BTreeMap::from([
-        ("format".to_owned(), FORMAT.to_owned()),
-        ("network".to_owned(), network.to_json()),
-        ("precision".to_owned(), options.precision.name().to_owned()),
-        ("batch_norm".to_owned(), flag(options.rewrites.batch_norm)),
-        ("projection".to_owned(), flag(options.rewrites.projection)),
-    ])
-}
-
 /// How model tensors lie in their file.
 pub(crate) const LAYOUT: Layout = Layout::Aligned;
-
-/// Refuses options that contradict themselves.
-pub(crate) fn check_options(options: Options) -> Result<()> {
-    if options.rewrites.projection && !options.rewrites.batch_norm {
-        return Err(Error::new(ErrorKind::Unsupported, "the projection can only be folded when batch norms are"));
-    }
-    Ok(())
-}
 
 #[cfg(test)]
 mod tests;

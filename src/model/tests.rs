@@ -90,7 +90,11 @@ fn models_say_what_they_are() {
             assert_eq!(*model.network(), network());
             assert!(model.checksum().is_some());
             let stored: Vec<String> = model.tensors().map(|(name, ..)| name).collect();
-            let expected = stored_parts(&network(), rewrites).into_iter().map(|(name, _)| name);
+            let graphs = model.form.graphs().expect("sound");
+            let expected = stored(&graphs).into_iter().flat_map(|(g, o)| {
+                let operation = &graphs[g].operations[o];
+                parts(&graphs[g], operation).into_iter().map(|part| format!("{}.{}", operation.name, part.suffix))
+            });
             assert!(stored.into_iter().eq(expected), "in this order");
             for unfolded in [false, true] {
                 let graph = model.graph(unfolded, Results::ALL);
@@ -120,7 +124,7 @@ fn metadata_that_is_wrong_is_named() {
     };
     refused(set("format", "voxcast-model-2"), "found \"voxcast-model-2\", expected \"voxcast-model-1\"");
     refused(set("format", "pt"), "found \"pt\"");
-    refused(set("precision", "f64"), "found \"f64\", expected f32 or f16");
+    refused(set("precision", "f64"), "found \"f64\", expected f32, f16 or int8");
     refused(set("projection", "yes"), "found \"yes\", expected folded or kept");
     refused(set("batch_norm", "kept"), "the batch norms are not");
     refused(set("network", "{}"), "network JSON: missing field");

@@ -129,9 +129,22 @@ impl Session {
     /// # Errors
     /// [`ErrorKind::Mismatch`] if the rig is not this network's; [`ErrorKind::TooLarge`] if there is not enough memory.
     pub fn new(model: Arc<Model>, rig: Arc<Rig>, options: &SessionOptions) -> Result<Self> {
+        let tables = Tables::new(&model, rig.cameras(), options)?;
+        Self::of_tables(model, rig, tables, options)
+    }
+
+    /// A session that runs `graph`, whose stored parts the model has, instead of the model's own.
+    ///
+    /// # Errors
+    /// As [`Session::new`].
+    pub(crate) fn of_graph(model: Arc<Model>, rig: Arc<Rig>, graph: Graph, options: &SessionOptions) -> Result<Self> {
+        let tables = Tables::of_graph(&model, graph, rig.cameras(), options)?;
+        Self::of_tables(model, rig, tables, options)
+    }
+
+    fn of_tables(model: Arc<Model>, rig: Arc<Rig>, tables: Tables, options: &SessionOptions) -> Result<Self> {
         let count = rig.cameras();
         check_rig(&rig, model.network(), count)?;
-        let tables = Tables::new(&model, count, options)?;
         let Memory { arena: bytes, .. } = tables.memory(count)?;
         let Tables { graph, plan, weights } = tables;
         let no_arena =

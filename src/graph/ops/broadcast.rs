@@ -19,7 +19,7 @@ impl Description for Broadcast {
     }
 
     fn execute(&self, call: &Call<'_>, mut tile: Tile<'_>) {
-        broadcast::<f32>(call.input(0), call.site.output().channels, call.site.first_channel, tile.output(0));
+        broadcast(call.input::<f32>(0), call.site.output().channels, call.site.first_channel, tile.output(0));
     }
 
     fn shader(&self, site: &Site<'_>) -> Option<Shader> {

@@ -2,6 +2,7 @@
 
 use crate::base::error::Result;
 use crate::graph::call::{Call, Tile};
+use crate::graph::element::Elements;
 use crate::graph::matrices::Level;
 use crate::graph::parts::Part;
 use crate::graph::site::Site;
@@ -50,6 +51,15 @@ pub trait Description: Debug + Sync {
     fn evaluate(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
         let _ = (site, weights);
         Ok(Vec::new())
+    }
+
+    /// Checks stored parts, which have their sizes, for what kernels take for granted of them: a model file may hold anything.
+    ///
+    /// # Errors
+    /// What was found and what was expected.
+    fn verify(&self, site: &Site<'_>, parts: &[Elements<'_>]) -> std::result::Result<(), String> {
+        let _ = (site, parts);
+        Ok(())
     }
 
     /// Bytes of scratch that a worker needs.

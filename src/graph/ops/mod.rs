@@ -12,6 +12,7 @@ mod gate;
 mod gather;
 mod global_mean;
 mod head;
+mod int8;
 mod max_pool;
 mod normalise;
 mod product;
@@ -65,4 +66,15 @@ operations! {
     global_mean::GlobalMean,
     broadcast::Broadcast,
     head::Head,
+    int8::NormaliseI8,
+    int8::ConvI8,
+    int8::DepthwiseI8,
+    int8::MaxPoolI8,
+    int8::UpsampleAddI8,
+    int8::GatherI8,
+    int8::GateI8,
+    int8::GlobalMeanI8,
+    int8::BroadcastI8,
+    int8::Quantise,
+    int8::Dequantise,
 }

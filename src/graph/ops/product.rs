@@ -3,6 +3,7 @@
 use super::description::{Machine, wide};
 use crate::base::error::Result;
 use crate::graph::call::{Added, Call, Tile};
+use crate::graph::element::Scalar;
 use crate::graph::parts::Part;
 use crate::graph::recipe::{ConvNames, Recipe};
 use crate::graph::site::Site;
@@ -55,9 +56,9 @@ pub(super) fn product<'a>(call: &Call<'a>, depth: usize) -> Product<'a> {
 }
 
 /// Rows, their distance and where they go: some channels of the tile's, from the first that the operation writes on.
-pub(super) fn rows<'a>(call: &Call<'_>, tile: &mut Tile<'a>) -> (Range<usize>, usize, &'a mut [f32]) {
+pub(super) fn rows<'a, T: Scalar>(call: &Call<'_>, tile: &mut Tile<'a>) -> (Range<usize>, usize, &'a mut [T]) {
     let stride = call.site.output().channels;
-    let out = tile.output::<f32>(0);
+    let out = tile.output::<T>(0);
     let after = stride - call.site.first_channel - call.site.channels;
     let end = out.len() - after;
     (tile.positions.clone(), stride, &mut out[call.site.first_channel..end])
@@ -65,15 +66,16 @@ pub(super) fn rows<'a>(call: &Call<'_>, tile: &mut Tile<'a>) -> (Range<usize>, u
 
 pub(super) fn evaluate(geometry: &Geometry, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
     let (inputs, outputs) = (site.input(0).channels, site.channels);
-    let Dense { weight, bias } = dense(geometry, site, weights)?;
+    let Dense { weight, bias } = dense(geometry, inputs, site, weights)?;
     Ok(vec![packed(&weight, inputs, outputs), padded(bias)])
 }
 
-fn dense(geometry: &Geometry, site: &Site<'_>, weights: &Weights<'_>) -> Result<Dense> {
-    let (inputs, outputs) = (site.input(0).channels, site.channels);
+/// Weights and bias of a convolution whose checkpoint has `inputs` input channels.
+pub(super) fn dense(geometry: &Geometry, inputs: usize, site: &Site<'_>, weights: &Weights<'_>) -> Result<Dense> {
+    let outputs = site.channels;
     let [d, h, w] = geometry.kernel;
     match site.recipe {
-        Recipe::Conv(names) => weights.dense(names, &checkpoint_shape(geometry, site), outputs),
+        Recipe::Conv(names) => weights.dense(names, &shape_of(geometry, inputs, site), outputs),
         Recipe::Projection { pixel, volume, bev } => {
             let (fpn, branch) = (inputs, outputs / 2);
             let taps = d * h * w;
@@ -95,8 +97,12 @@ fn dense(geometry: &Geometry, site: &Site<'_>, weights: &Weights<'_>) -> Result<
 
 /// Shape of a convolution's weights in a checkpoint: the published modules are Conv3d over volumes, else Conv2d.
 pub(super) fn checkpoint_shape(geometry: &Geometry, site: &Site<'_>) -> Vec<usize> {
+    shape_of(geometry, site.input(0).channels, site)
+}
+
+fn shape_of(geometry: &Geometry, inputs: usize, site: &Site<'_>) -> Vec<usize> {
     let [d, h, w] = geometry.kernel;
-    let (inputs, outputs) = (site.input(0).channels, site.channels);
+    let outputs = site.channels;
     match site.output().space {
         Space::Volume => vec![outputs, inputs, d, h, w],
         Space::Image | Space::Plane => vec![outputs, inputs, h, w],

@@ -40,8 +40,16 @@ pub(super) struct Tables {
 
 impl Tables {
     pub(super) fn new(model: &Model, cameras: usize, options: &SessionOptions) -> Result<Self> {
+        if options.unfolded && model.quantisation().is_some() {
+            let message = "a model of int8 has no graph without the projection fold";
+            return Err(Error::new(ErrorKind::Unsupported, message));
+        }
         let results = Results { logits: options.logits, coarse_heads: options.coarse_heads };
-        let graph = model.graph(options.unfolded, results);
+        Self::of_graph(model, model.graph(options.unfolded, results), cameras, options)
+    }
+
+    /// Those of a graph whose stored parts the model has.
+    pub(super) fn of_graph(model: &Model, graph: Graph, cameras: usize, options: &SessionOptions) -> Result<Self> {
         let plan = Plan::new(&graph, cameras, options.threads.count())?;
         let weights = graph.operations.iter().map(|o| model.part_refs(&graph, o)).collect::<Result<_>>()?;
         Ok(Self { graph, plan, weights })

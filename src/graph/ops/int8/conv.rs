@@ -1,0 +1,103 @@
+//! Convolution of 8-bit tensors, and the offsets of a deformable one.
+
+use super::columns::Steps;
+use super::{product, step};
+use crate::base::error::Result;
+use crate::graph::call::{Call, Tile};
+use crate::graph::element::{Element, Elements};
+use crate::graph::ops::deform_conv::DeformConv;
+use crate::graph::ops::description::{Description, Machine};
+use crate::graph::ops::product as floating;
+use crate::graph::parts::Part;
+use crate::graph::site::Site;
+use crate::graph::weights::{Values, Weights};
+use voxcast_kernels::conv::Geometry;
+use voxcast_kernels::conv_i8::{ConvI8 as Kernel, conv_i8, conv_i8_wide};
+
+/// Steps of an offset: positions in units of 1/256 pixel, the logits of masks in units of 1/64.
+const POSITION: f64 = 1.0 / 256.0;
+const LOGIT: f64 = 1.0 / 64.0;
+
+/// [`voxcast_kernels::conv_i8`]: x. With an output of `i32` it computes the offsets of a deformable convolution, in its units.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ConvI8 {
+    /// How x is walked.
+    pub geometry: Geometry,
+    /// Whether x may be negative.
+    pub signed: bool,
+    /// Channels of x that the checkpoint knows; those after are 0.
+    pub inputs: usize,
+}
+
+impl ConvI8 {
+    /// What output `n` counts in, of a tensor without scale.
+    fn offset_step(&self, site: &Site<'_>, n: usize) -> f64 {
+        let taps = self.geometry.kernel.iter().product();
+        debug_assert_eq!(site.channels, DeformConv::offset_channels(taps));
+        if n < 2 * taps { POSITION } else { LOGIT }
+    }
+}
+
+impl Description for ConvI8 {
+    fn kind(&self) -> &'static str {
+        match self.geometry.kernel {
+            [1, 1, 1] => "conv 1x1 i8",
+            [1, ..] => "conv2d i8",
+            _ => "conv3d i8",
+        }
+    }
+
+    fn overwrites_residual(&self) -> bool {
+        true
+    }
+
+    fn parts(&self, site: &Site<'_>) -> Vec<Part> {
+        product::parts(1, self.geometry.depth(), site.channels, site.residual.is_some())
+    }
+
+    fn evaluate(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
+        let dense = floating::dense(&self.geometry, self.inputs, site, weights)?;
+        let offsets = site.output().element == Element::I32;
+        let steps = |n| Steps {
+            input: step(site.input(0)),
+            output: if offsets { self.offset_step(site, n) } else { step(site.output()) },
+            residual: site.added().map(step),
+        };
+        let channels = [self.inputs, self.geometry.channels];
+        let columns =
+            product::columns(&dense.weight, &dense.bias, channels, |n, weight, bias| steps(n).column(weight, bias))?;
+        Ok(product::values(1, &columns, site.residual.is_some()))
+    }
+
+    fn verify(&self, site: &Site<'_>, parts: &[Elements<'_>]) -> std::result::Result<(), String> {
+        product::verify(self.geometry.depth(), site.channels, parts)
+    }
+
+    fn scratch(&self, site: &Site<'_>) -> usize {
+        product::scratch(self.geometry.depth(), site.channels)
+    }
+
+    fn multiply_adds(&self, site: &Site<'_>) -> u128 {
+        floating::multiply_adds(&Geometry { channels: self.inputs, ..self.geometry }, site)
+    }
+
+    fn executed_multiply_adds(&self, site: &Site<'_>) -> u128 {
+        floating::multiply_adds(&self.geometry, site)
+    }
+
+    fn tile(&self, site: &Site<'_>, machine: Machine) -> usize {
+        floating::rows_per_tile(site, machine)
+    }
+
+    fn execute(&self, call: &Call<'_>, mut tile: Tile<'_>) {
+        let product = product::product(call, self.geometry.depth(), self.signed);
+        let args = Kernel { geometry: self.geometry, input: call.input(0), product };
+        if call.site.output().element == Element::I32 {
+            let (rows, stride, out) = floating::rows(call, &mut tile);
+            conv_i8_wide(call.isa, &args, rows, stride, out, tile.scratch());
+        } else {
+            let (rows, stride, out) = floating::rows(call, &mut tile);
+            conv_i8(call.isa, &args, rows, stride, out, tile.scratch());
+        }
+    }
+}
