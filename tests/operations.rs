@@ -24,6 +24,8 @@ use voxcast_kernels::upsample_add::{UpsampleAdd, upsample_add};
 use voxcast_kernels::window_attention::{Shape, WindowAttention, window_attention};
 use voxcast_kernels::{LANES, Panels};
 
+#[path = "support/named.rs"]
+mod named;
 #[path = "support/operations.rs"]
 mod table;
 

@@ -3,7 +3,9 @@
 pub mod conv;
 pub mod conv_i8;
 pub mod deconv3d;
+pub mod deconv3d_i8;
 pub mod deform_conv2d;
+pub mod deform_conv2d_i8;
 pub mod depthwise;
 pub mod depthwise_i8;
 pub mod dequantise;
@@ -12,6 +14,7 @@ pub mod gate_i8;
 pub mod gather;
 pub mod gather_i8;
 pub mod head;
+pub mod head_i8;
 pub mod max_pool;
 pub mod max_pool_i8;
 pub mod mean_i8;
@@ -44,7 +47,9 @@ registry! {
     conv
     conv_i8
     deconv3d
+    deconv3d_i8
     deform_conv2d
+    deform_conv2d_i8
     depthwise
     depthwise_i8
     dequantise
@@ -53,6 +58,7 @@ registry! {
     gather
     gather_i8
     head
+    head_i8
     max_pool
     max_pool_i8
     mean_i8

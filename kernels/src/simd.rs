@@ -171,8 +171,6 @@ pub(crate) trait Simd: Copy {
     fn shift_right_signed(self, a: Self::I, bits: u32) -> Self::I;
     /// The larger of signed integers.
     fn max_int(self, a: Self::I, b: Self::I) -> Self::I;
-    /// The smaller of signed integers.
-    fn min_int(self, a: Self::I, b: Self::I) -> Self::I;
     /// `a * b` for lanes from -2^15 up to 2^15 - 1; any integer for others. Fast where `b` is a loop's constant.
     fn mul_short(self, a: Self::I, b: Self::I) -> Self::I;
     /// [`crate::quantised::requantise`] of signed integers.

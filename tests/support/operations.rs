@@ -1,6 +1,7 @@
 //! The table of single operations that the reference computes and the kernels are held to: shapes, and inputs drawn from
 //! each case's name. Everything is channels first, as checkpoints and PyTorch have it.
 
+use super::named;
 use voxcast::random::Random;
 
 /// One operation on one shape.
@@ -182,8 +183,7 @@ pub(crate) fn table() -> Vec<Case> {
 
 impl Case {
     fn random(&self, what: &str) -> Random {
-        let seed = self.name.bytes().chain(*b":").chain(what.bytes());
-        Random::new(seed.fold(0xcbf2_9ce4_8422_2325, |h, b| (h ^ u64::from(b)).wrapping_mul(0x0100_0000_01b3)))
+        named::random(self.name, what)
     }
 
     /// Inputs: close to standard normal.
@@ -231,16 +231,6 @@ impl Case {
 
     /// A matrix with rows of these lengths: offsets, then ascending columns below `columns` without duplicates.
     pub(crate) fn matrix(&self, rows: &[usize], columns: usize) -> (Vec<u32>, Vec<u32>) {
-        let mut random = self.random("matrix");
-        let (mut ptr, mut col) = (vec![0], vec![]);
-        for &len in rows {
-            let mut row = std::collections::BTreeSet::new();
-            while row.len() < len {
-                row.insert(random.below(columns) as u32);
-            }
-            col.extend(row);
-            ptr.push(col.len() as u32);
-        }
-        (ptr, col)
+        named::matrix(self.random("matrix"), rows, columns)
     }
 }

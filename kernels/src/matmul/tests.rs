@@ -1,5 +1,5 @@
 use super::driver::{DEPTH, Source};
-use super::product::{Product, Rows, SCRATCH};
+use super::product::{Multiply, Product, Rows, SCRATCH};
 use crate::isa::Isa;
 use crate::simd::Simd;
 use crate::testing::{

@@ -15,7 +15,7 @@ use crate::matmul::driver::{Source, Target};
 use crate::matmul::layout::packed_len;
 use crate::matmul::product::Multiply;
 use crate::matmul::{Panels, Product, Residual};
-use crate::ops::conv::{Conv, Geometry};
+use crate::ops::conv::{Geometry, Walk};
 use crate::simd::{Kernel, Simd, dispatch};
 use core::ops::Range;
 
@@ -54,15 +54,9 @@ pub struct Deconv3d<'a> {
 /// # Determinism
 /// The same bits on every instruction set and for every division into planes.
 pub fn deconv3d(isa: Isa, args: &Deconv3d<'_>, planes: Range<usize>, out: &mut [f32], scratch: &mut [f32]) {
-    let [d, h, w] = args.extent;
     assert_eq!(args.weights.len(), 8 * args.parity_len(), "packed weights do not match the shape");
-    let part = args.part([0; 3]);
-    part.geometry.check(args.input);
-    part.product.check(0, scratch);
-    let plane = 4 * h * w * args.columns;
-    assert!(planes.start <= planes.end && planes.end <= 2 * d, "planes {planes:?} of {}", 2 * d);
-    assert_eq!(out.len(), planes.len() * plane, "the output does not hold the planes");
-    assert!(args.add.is_none_or(|a| a.len() == 2 * d * plane), "the added tensor has another shape");
+    let plane = args.check(&planes, out, scratch);
+    assert!(args.add.is_none_or(|a| a.len() == 2 * args.extent[0] * plane), "the added tensor has another shape");
     dispatch(isa, Run { args, planes, out, scratch });
 }
 
@@ -70,39 +64,84 @@ impl<'a> Deconv3d<'a> {
     fn parity_len(&self) -> usize {
         packed_len(8 * self.channels, self.columns)
     }
+}
 
-    /// The sub-convolution of one parity.
-    fn part(&self, parity: [usize; 3]) -> Conv<'a> {
-        let index = (parity[0] * 2 + parity[1]) * 2 + parity[2];
-        let range = index * self.parity_len()..(index + 1) * self.parity_len();
+impl<'a> Parts for Deconv3d<'a> {
+    type Product = Product<'a>;
+
+    fn extent(&self) -> [usize; 3] {
+        self.extent
+    }
+
+    fn part(&self, parity: usize) -> (Walk<'a, f32>, Product<'a>) {
+        let range = parity * self.parity_len()..(parity + 1) * self.parity_len();
         let residual = match self.add {
             Some(rows) => Residual::After { rows, stride: self.columns },
             None => Residual::None,
         };
-        Conv {
-            geometry: Geometry {
-                input: self.extent,
-                channels: self.channels,
-                kernel: [2; 3],
-                stride: [1; 3],
-                dilation: [1; 3],
-                padding: parity.map(|p| 1 - p),
-                output: self.extent,
+        let product = Product {
+            weights: match self.weights {
+                Panels::F32(w) => Panels::F32(&w[range]),
+                Panels::F16(w) => Panels::F16(&w[range]),
             },
-            input: self.input,
-            product: Product {
-                weights: match self.weights {
-                    Panels::F32(w) => Panels::F32(&w[range]),
-                    Panels::F16(w) => Panels::F16(&w[range]),
-                },
-                bias: self.bias,
-                depth: 8 * self.channels,
-                columns: self.columns,
-                relu: self.relu,
-                residual,
-            },
-        }
+            bias: self.bias,
+            depth: 8 * self.channels,
+            columns: self.columns,
+            relu: self.relu,
+            residual,
+        };
+        (Walk { geometry: geometry(self.extent, self.channels, parity), input: self.input }, product)
     }
+}
+
+/// A transposed convolution as eight plain ones, one per parity.
+pub(crate) trait Parts {
+    /// The product of each of them.
+    type Product: Multiply<Left: Default>;
+
+    /// Input extent.
+    fn extent(&self) -> [usize; 3];
+
+    /// The convolution of parity `(p_d * 2 + p_h) * 2 + p_w`.
+    fn part(&self, parity: usize) -> (Walk<'_, <Self::Product as Multiply>::Left>, Self::Product);
+
+    /// The size of a plane of the output.
+    ///
+    /// # Panics
+    /// If a slice does not have the size that the shapes ask for.
+    fn check(
+        &self,
+        planes: &Range<usize>,
+        out: &[<Self::Product as Multiply>::Out],
+        scratch: &[<Self::Product as Multiply>::Scratch],
+    ) -> usize {
+        let [d, h, w] = self.extent();
+        let (walk, product) = self.part(0);
+        walk.geometry.check(walk.input);
+        product.check(0, scratch);
+        let plane = 4 * h * w * product.columns();
+        assert!(planes.start <= planes.end && planes.end <= 2 * d, "planes {planes:?} of {}", 2 * d);
+        assert_eq!(out.len(), planes.len() * plane, "the output does not hold the planes");
+        plane
+    }
+}
+
+/// How the convolution of one parity walks the input.
+pub(crate) fn geometry(extent: [usize; 3], channels: usize, parity: usize) -> Geometry {
+    Geometry {
+        input: extent,
+        channels,
+        kernel: [2; 3],
+        stride: [1; 3],
+        dilation: [1; 3],
+        padding: axes(parity).map(|p| 1 - p),
+        output: extent,
+    }
+}
+
+/// A parity's parities per axis.
+fn axes(parity: usize) -> [usize; 3] {
+    [parity / 4, parity / 2 % 2, parity % 2]
 }
 
 /// Rows of one input plane, as positions of one parity in one output plane.
@@ -134,45 +173,56 @@ impl Target for Interleaved {
     }
 }
 
-struct Run<'a> {
-    args: &'a Deconv3d<'a>,
-    planes: Range<usize>,
-    out: &'a mut [f32],
-    scratch: &'a mut [f32],
+/// The planes `planes` of the output, densely in `out`.
+pub(crate) struct Run<'a, D: Parts> {
+    pub(crate) args: &'a D,
+    pub(crate) planes: Range<usize>,
+    pub(crate) out: &'a mut [<D::Product as Multiply>::Out],
+    pub(crate) scratch: &'a mut [<D::Product as Multiply>::Scratch],
 }
 
-impl Run<'_> {
+impl<D: Parts> Run<'_, D> {
     /// Calls `part` with each sub-convolution, its input rows, its places, and the output plane.
     #[inline(always)]
-    fn each(self, mut part: impl FnMut(&Conv<'_>, Range<usize>, &Interleaved, &mut [f32], &mut [f32])) {
-        let args = self.args;
-        let [_, h, w] = args.extent;
-        for (x, out) in self.planes.zip(self.out.chunks_exact_mut((4 * h * w * args.columns).max(1))) {
+    fn each(
+        self,
+        mut part: impl FnMut(
+            (Walk<'_, <D::Product as Multiply>::Left>, D::Product),
+            Range<usize>,
+            &Interleaved,
+            &mut [<D::Product as Multiply>::Out],
+            &mut [<D::Product as Multiply>::Scratch],
+        ),
+    ) {
+        let extent = self.args.extent();
+        let [_, h, w] = extent;
+        let columns = self.args.part(0).1.columns();
+        for (x, out) in self.planes.zip(self.out.chunks_exact_mut((4 * h * w * columns).max(1))) {
             for yz in 0..4 {
-                let parity = [x % 2, yz / 2, yz % 2];
-                let target = Interleaved { extent: args.extent, columns: args.columns, parity };
+                let parity = x % 2 * 4 + yz;
+                let target = Interleaved { extent, columns, parity: axes(parity) };
                 let rows = x / 2 * h * w..(x / 2 + 1) * h * w;
-                part(&args.part(parity), rows, &target, out, self.scratch);
+                part(self.args.part(parity), rows, &target, out, self.scratch);
             }
         }
     }
 }
 
-impl Kernel for Run<'_> {
+impl<D: Parts> Kernel for Run<'_, D> {
     type Output = ();
 
     #[inline(always)]
     fn reference(self) {
         self.each(
             #[inline(always)]
-            |conv, rows, target, out, _| {
+            |(walk, product), rows, target, out, _| {
                 for row in rows {
-                    let out = &mut out[target.offset(row)..][..conv.product.columns];
-                    conv.product.reference(
+                    let out = &mut out[target.offset(row)..][..product.columns()];
+                    product.reference(
                         target.residual_row(row),
                         out,
                         #[inline(always)]
-                        |k| conv.walk().element(row, k),
+                        |k| walk.element(row, k),
                     );
                 }
             },
@@ -183,7 +233,7 @@ impl Kernel for Run<'_> {
     fn run<S: Simd>(self, s: S) {
         self.each(
             #[inline(always)]
-            |conv, rows, target, out, scratch| conv.product.compute(s, &conv.walk(), target, rows, out, scratch),
+            |(walk, product), rows, target, out, scratch| product.compute(s, &walk, target, rows, out, scratch),
         );
     }
 }

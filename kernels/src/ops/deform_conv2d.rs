@@ -57,8 +57,7 @@ pub fn deform_conv2d(
 ) {
     let g = &args.geometry;
     g.check(args.input);
-    let flat = [g.input[0], g.output[0], g.kernel[0]] == [1; 3] && g.padding[0] == 0;
-    assert!(flat, "a deformable convolution is two-dimensional");
+    g.check_flat();
     assert_eq!(args.product.depth, g.depth(), "the weights belong to another kernel");
     assert_eq!(args.offsets.len(), g.rows() * 3 * args.taps(), "the offsets belong to another kernel");
     Rows { product: &args.product, source: args, rows, stride, out, scratch }.compute(isa, g.rows());

@@ -150,7 +150,20 @@ impl<S: Simd> Arithmetic<S, f32, f32> for Chains {
     }
     #[inline(always)]
     fn finish(self, s: S, _: usize, sum: S::V, x: Option<S::V>, out: &mut [f32]) {
-        s.store_part(out, x.map_or(sum, |x| s.add(sum, x)));
+        let sum = if let Some(x) = x { s.add(sum, x) } else { sum };
+        s.store_part(out, sum);
+    }
+}
+
+/// Up to 16 elements; all 16 if `WHOLE`.
+#[inline(always)]
+fn load<S: Simd, A: Arithmetic<S, T, B>, T, B, const WHOLE: bool>(s: S, arithmetic: A, x: &[T]) -> A::Lanes {
+    if WHOLE {
+        let x: &[T; LANES] = x.first_chunk().expect("16 channels");
+        // SAFETY: the array holds 16 elements.
+        unsafe { arithmetic.load_ptr(s, x.as_ptr()) }
+    } else {
+        arithmetic.load_part(s, x)
     }
 }
 
@@ -212,25 +225,16 @@ impl<T: Copy, B: Copy> Depthwise<'_, T, B> {
     ) {
         let padded = self.channels.next_multiple_of(LANES);
         let lanes = if WHOLE { LANES } else { self.channels - c };
-        let whole = |x: &[T; LANES]| {
-            // SAFETY: the array holds 16 elements.
-            unsafe { arithmetic.load_ptr(s, x.as_ptr()) }
-        };
-        let load = |at: usize| {
-            let x = &self.input[at..at + lanes];
-            if WHOLE { whole(x.first_chunk().expect("16 channels")) } else { arithmetic.load_part(s, x) }
-        };
-        let weights = |ky: usize, kx: usize| {
-            let w = &self.weights[(ky * self.kernel + kx) * padded + c..];
-            whole(w.first_chunk().expect("padded channels"))
-        };
         let mut sums = [arithmetic.bias(s, self.bias[c..].first_chunk().expect("padded channels")); N];
         for ky in 0..self.kernel {
             // Where no tap leaves the row, all of a row of taps are one piece of memory.
             let piece = if N > 1 { self.offset(y + ky, x) } else { None };
             let piece = piece.map(|at| &self.input[at + c..][..(N + self.kernel - 2) * self.channels + lanes]);
             for kx in 0..self.kernel {
-                let w = weights(ky, kx);
+                let w: &[T; LANES] =
+                    self.weights[(ky * self.kernel + kx) * padded + c..].first_chunk().expect("padded channels");
+                // SAFETY: the array holds 16 weights.
+                let w = unsafe { arithmetic.load_ptr(s, w.as_ptr()) };
                 match piece {
                     Some(piece) => {
                         for (i, sum) in sums.iter_mut().enumerate() {
@@ -246,7 +250,10 @@ impl<T: Copy, B: Copy> Depthwise<'_, T, B> {
                     }
                     None => {
                         for (i, sum) in sums.iter_mut().enumerate() {
-                            let x = self.offset(y + ky, x + i + kx).map_or(arithmetic.zero(s), |at| load(at + c));
+                            let x = match self.offset(y + ky, x + i + kx) {
+                                Some(at) => load::<S, A, T, B, WHOLE>(s, arithmetic, &self.input[at + c..][..lanes]),
+                                None => arithmetic.zero(s),
+                            };
                             *sum = arithmetic.mul_add(s, x, w, *sum);
                         }
                     }
@@ -254,7 +261,12 @@ impl<T: Copy, B: Copy> Depthwise<'_, T, B> {
             }
         }
         for (i, sum) in sums.into_iter().enumerate() {
-            let x = self.residual.then(|| load((y * self.width + x + i) * self.channels + c));
+            let x = if self.residual {
+                let at = (y * self.width + x + i) * self.channels + c;
+                Some(load::<S, A, T, B, WHOLE>(s, arithmetic, &self.input[at..][..lanes]))
+            } else {
+                None
+            };
             arithmetic.finish(s, c, sum, x, &mut out[i * self.channels + c..][..lanes]);
         }
     }

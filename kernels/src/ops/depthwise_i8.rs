@@ -118,12 +118,17 @@ impl<S: Simd> Arithmetic<S, i8, i32> for Integers<'_> {
     }
     #[inline(always)]
     fn finish(self, s: S, channel: usize, mut sum: S::I, x: Option<S::I>, out: &mut [i8]) {
-        let load = |x: &[i32]| s.load_int(x[channel..].first_chunk().expect("padded channels"));
         if let Some(x) = x {
-            sum = s.add_int(sum, s.mul_int(x, load(self.0.residual)));
+            sum = s.add_int(sum, s.mul_int(x, columns(s, self.0.residual, channel)));
         }
-        s.store_bytes_part(out, s.quantised(s.requantise(sum, load(self.0.multiplier)), false));
+        s.store_bytes_part(out, s.quantised(s.requantise(sum, columns(s, self.0.multiplier, channel)), false));
     }
+}
+
+/// The values of 16 channels.
+#[inline(always)]
+fn columns<S: Simd>(s: S, x: &[i32], channel: usize) -> S::I {
+    s.load_int(x[channel..].first_chunk().expect("padded channels"))
 }
 
 #[cfg(feature = "cases")]

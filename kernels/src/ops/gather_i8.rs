@@ -107,9 +107,9 @@ impl Kernel for Run<'_> {
                         // SAFETY: these pixels exist, and with them all channels that are gathered, of which these are some.
                         unsafe { sum_bytes(s, cols.len(), |i| place(cols, i), &mut sums) };
                     }
-                    for (v, sum) in sums.into_iter().enumerate() {
+                    for v in 0..VECTORS {
                         let at = v * LANES;
-                        finish(s, a, channel + at, multiplier, sum, &mut out[at..at + LANES]);
+                        finish(s, a, channel + at, multiplier, sums[v], &mut out[at..at + LANES]);
                     }
                     channel += VECTORS * LANES;
                 } else {
@@ -145,18 +145,22 @@ pub(super) unsafe fn sum_bytes<S: Simd, const N: usize>(
     place: impl Fn(usize) -> *const i8,
     sums: &mut [S::I; N],
 ) {
-    for start in (0..count).step_by(RUN) {
-        // SAFETY: `start` is below `count`, and so is every `i`, so the caller's promise holds; v is below N.
-        let load = |i, v| unsafe { s.bytes_to_short(s.load_bytes_ptr(place(i).add(v * LANES))) };
-        let mut short: [S::H; N] = core::array::from_fn(|v| load(start, v));
-        for i in start + 1..count.min(start + RUN) {
-            for (v, sum) in short.iter_mut().enumerate() {
-                *sum = s.add_short(*sum, load(i, v));
+    let mut start = 0;
+    while start < count {
+        let end = count.min(start + RUN);
+        let mut short = [s.bytes_to_short(s.splat_bytes(0)); N];
+        for i in start..end {
+            let at = place(i);
+            for v in 0..N {
+                // SAFETY: i is below `count`, so the caller's promise holds; v is below N.
+                let x = unsafe { s.load_bytes_ptr(at.add(v * LANES)) };
+                short[v] = s.add_short(short[v], s.bytes_to_short(x));
             }
         }
-        for (sum, short) in sums.iter_mut().zip(short) {
-            *sum = s.add_int(*sum, s.short_to_int(short));
+        for v in 0..N {
+            sums[v] = s.add_int(sums[v], s.short_to_int(short[v]));
         }
+        start = end;
     }
 }
 

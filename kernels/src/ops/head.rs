@@ -77,18 +77,18 @@ impl<'a> Head<'a> {
 }
 
 /// Rows that lie in memory, densely.
-struct Rows<'a> {
-    data: &'a [f32],
-    stride: usize,
+pub(crate) struct Rows<'a, E> {
+    pub(crate) data: &'a [E],
+    pub(crate) stride: usize,
 }
 
-impl Source for Rows<'_> {
-    type Element = f32;
+impl<E: Copy> Source for Rows<'_, E> {
+    type Element = E;
     type At = usize;
     type Part = usize;
 
     #[inline(always)]
-    fn element(&self, row: usize, k: usize) -> f32 {
+    fn element(&self, row: usize, k: usize) -> E {
         self.data[row * self.stride + k]
     }
     #[inline(always)]
@@ -104,14 +104,14 @@ impl Source for Rows<'_> {
         (k, self.stride - k)
     }
     #[inline(always)]
-    fn piece<'a, S: Simd>(&'a self, _: S, row: usize, k: usize, spare: &'a mut [f32]) -> &'a [f32] {
+    fn piece<'a, S: Simd>(&'a self, _: S, row: usize, k: usize, spare: &'a mut [E]) -> &'a [E] {
         &self.data[row * self.stride + k..][..spare.len()]
     }
 }
 
 /// The first of the largest.
 #[inline(always)]
-fn largest(logits: &[f32]) -> u8 {
+pub(crate) fn largest<T: PartialOrd>(logits: &[T]) -> u8 {
     let mut best = 0;
     for k in 1..logits.len() {
         if logits[k] > logits[best] {

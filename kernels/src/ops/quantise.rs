@@ -42,7 +42,7 @@ impl Kernel for Run<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let [inverse, low, high] = [self.inverse, -127.0, 127.0].map(|x| s.splat(x));
+        let (inverse, low, high) = (s.splat(self.inverse), s.splat(-127.0), s.splat(127.0));
         for (out, x) in self.out.chunks_mut(LANES).zip(self.input.chunks(LANES)) {
             let scaled = s.mul(s.load_part(x), inverse);
             let nearest = s.nearest(s.max(s.min(scaled, high), low));

@@ -61,14 +61,16 @@ impl Kernel for Run<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
         let a = self.args;
-        let [own, other] = self.factors.map(|factor| s.splat_int(factor.cast_unsigned()));
+        let [own, other] = self.factors;
+        let (own, other) = (s.splat_int(own.cast_unsigned()), s.splat_int(other.cast_unsigned()));
         let half = s.splat_int(HALF.cast_unsigned());
         for (y, row) in self.rows.zip(self.out.chunks_exact_mut(a.width * a.channels)) {
             for (x, out) in row.chunks_exact_mut(a.channels).enumerate() {
                 let low = &a.low[a.offset(y, x)..][..a.channels];
                 for (out, low) in out.chunks_mut(LANES).zip(low.chunks(LANES)) {
-                    let [x, low] = [s.load_bytes_part(out), s.load_bytes_part(low)].map(|x| s.bytes_to_int(x));
-                    let sum = s.add_int(s.mul_short(x, own), s.add_int(s.mul_short(low, other), half));
+                    let (x, low) = (s.load_bytes_part(out), s.load_bytes_part(low));
+                    let low = s.mul_short(s.bytes_to_int(low), other);
+                    let sum = s.add_int(s.mul_short(s.bytes_to_int(x), own), s.add_int(low, half));
                     s.store_bytes_part(out, s.quantised(s.shift_right_signed(sum, FRACTION), false));
                 }
             }

@@ -23,6 +23,35 @@ macro_rules! halves {
     };
 }
 
+// What takes more than an instruction or two is a function of its own: a closure has no instructions enabled, and what it
+// calls may stay a call.
+
+/// 2 to the power of each lane.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn exp2_int(n: __m256) -> __m256 {
+    let biased = _mm256_add_epi32(_mm256_cvtps_epi32(n), _mm256_set1_epi32(127));
+    _mm256_castsi256_ps(_mm256_slli_epi32::<23>(biased))
+}
+
+/// [`crate::quantised::requantise`], of products of 64 bits of the even lanes, and of the odd ones.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn requantise(sum: __m256i, multiplier: __m256i) -> __m256i {
+    let half = _mm256_set1_epi64x(1 << 31);
+    let odd = _mm256_mul_epi32(_mm256_srli_epi64::<32>(sum), _mm256_srli_epi64::<32>(multiplier));
+    let even = _mm256_srli_epi64::<32>(_mm256_add_epi64(_mm256_mul_epi32(sum, multiplier), half));
+    _mm256_blend_epi32::<0b1010_1010>(even, _mm256_add_epi64(odd, half))
+}
+
+/// `a * b` of lanes that fit into 16 bits: a sum of two products, of the halves of a lane. Without the sign in `b`'s upper
+/// half the second is 0.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn mul_short(a: __m256i, b: __m256i) -> __m256i {
+    _mm256_madd_epi16(a, _mm256_and_si256(b, _mm256_set1_epi32(0xffff)))
+}
+
 impl Simd for Avx2 {
     type V = [__m256; 2];
     type I = [__m256i; 2];
@@ -130,11 +159,7 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn exp2_int(self, n: Self::V) -> Self::V {
-        // SAFETY: the token `self` proves that the CPU has AVX2.
-        n.map(|n| unsafe {
-            let biased = _mm256_add_epi32(_mm256_cvtps_epi32(n), _mm256_set1_epi32(127));
-            _mm256_castsi256_ps(_mm256_slli_epi32::<23>(biased))
-        })
+        halves!(exp2_int(n))
     }
     #[inline(always)]
     fn splat_int(self, x: u32) -> Self::I {
@@ -179,35 +204,22 @@ impl Simd for Avx2 {
     #[inline(always)]
     fn shift_right_signed(self, a: Self::I, bits: u32) -> Self::I {
         // SAFETY: the token `self` proves that the CPU has AVX2.
-        a.map(|a| unsafe { _mm256_sra_epi32(a, _mm_cvtsi32_si128(bits.cast_signed())) })
+        unsafe {
+            let bits = _mm_cvtsi32_si128(bits.cast_signed());
+            [_mm256_sra_epi32(a[0], bits), _mm256_sra_epi32(a[1], bits)]
+        }
     }
     #[inline(always)]
     fn max_int(self, a: Self::I, b: Self::I) -> Self::I {
         halves!(_mm256_max_epi32(a, b))
     }
     #[inline(always)]
-    fn min_int(self, a: Self::I, b: Self::I) -> Self::I {
-        halves!(_mm256_min_epi32(a, b))
-    }
-    #[inline(always)]
     fn mul_short(self, a: Self::I, b: Self::I) -> Self::I {
-        // A sum of two products, of the halves of a lane. Without the sign in `b`'s upper half the second is 0.
-        // SAFETY: the token `self` proves that the CPU has AVX2.
-        unsafe { [0, 1].map(|i| _mm256_madd_epi16(a[i], _mm256_and_si256(b[i], _mm256_set1_epi32(0xffff)))) }
+        halves!(mul_short(a, b))
     }
     #[inline(always)]
     fn requantise(self, sum: Self::I, multiplier: Self::I) -> Self::I {
-        // Products of 64 bits of the even lanes, and of the odd ones.
-        // SAFETY: the token `self` proves that the CPU has AVX2.
-        unsafe {
-            let half = _mm256_set1_epi64x(1 << 31);
-            [0, 1].map(|i| {
-                let odd = |x| _mm256_srli_epi64::<32>(x);
-                let even_product = _mm256_add_epi64(_mm256_mul_epi32(sum[i], multiplier[i]), half);
-                let odd_product = _mm256_add_epi64(_mm256_mul_epi32(odd(sum[i]), odd(multiplier[i])), half);
-                _mm256_blend_epi32::<0b1010_1010>(odd(even_product), odd_product)
-            })
-        }
+        halves!(requantise(sum, multiplier))
     }
     #[inline(always)]
     fn to_float(self, a: Self::I) -> Self::V {
@@ -256,8 +268,8 @@ impl Simd for Avx2 {
     fn short_to_int(self, a: Self::H) -> Self::I {
         // SAFETY: the token `self` proves that the CPU has AVX2.
         unsafe {
-            let halves = [_mm256_castsi256_si128(a), _mm256_extracti128_si256::<1>(a)];
-            halves.map(|half| _mm256_cvtepi16_epi32(half))
+            let upper = _mm256_extracti128_si256::<1>(a);
+            [_mm256_cvtepi16_epi32(_mm256_castsi256_si128(a)), _mm256_cvtepi16_epi32(upper)]
         }
     }
     #[inline(always)]

@@ -177,10 +177,6 @@ impl Simd for Avx512 {
         lanewise!(_mm512_max_epi32(a, b))
     }
     #[inline(always)]
-    fn min_int(self, a: Self::I, b: Self::I) -> Self::I {
-        lanewise!(_mm512_min_epi32(a, b))
-    }
-    #[inline(always)]
     fn mul_short(self, a: Self::I, b: Self::I) -> Self::I {
         // A sum of two products, of the halves of a lane. Without the sign in `b`'s upper half the second is 0.
         lanewise!(_mm512_madd_epi16(a, _mm512_and_si512(b, _mm512_set1_epi32(0xffff))))
@@ -190,10 +186,9 @@ impl Simd for Avx512 {
         // Products of 64 bits of the even lanes, and of the odd ones.
         lanewise!({
             let half = _mm512_set1_epi64(1 << 31);
-            let odd = |x| _mm512_srli_epi64::<32>(x);
-            let even_product = _mm512_add_epi64(_mm512_mul_epi32(sum, multiplier), half);
-            let odd_product = _mm512_add_epi64(_mm512_mul_epi32(odd(sum), odd(multiplier)), half);
-            _mm512_mask_blend_epi32(0b1010_1010_1010_1010, odd(even_product), odd_product)
+            let odd = _mm512_mul_epi32(_mm512_srli_epi64::<32>(sum), _mm512_srli_epi64::<32>(multiplier));
+            let even = _mm512_srli_epi64::<32>(_mm512_add_epi64(_mm512_mul_epi32(sum, multiplier), half));
+            _mm512_mask_blend_epi32(0b1010_1010_1010_1010, even, _mm512_add_epi64(odd, half))
         })
     }
     #[inline(always)]

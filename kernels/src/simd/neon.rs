@@ -38,23 +38,27 @@ macro_rules! select {
 }
 
 /// The same bits as signed integers.
-///
-/// # Safety
-/// The CPU must have NEON.
-#[inline(always)]
-unsafe fn signed(a: [uint32x4_t; 4]) -> [int32x4_t; 4] {
-    // SAFETY: the caller promises NEON.
-    a.map(|a| unsafe { vreinterpretq_s32_u32(a) })
+macro_rules! signed {
+    ($x:expr) => {{
+        let x = $x;
+        quarters!(vreinterpretq_s32_u32(x))
+    }};
 }
 
 /// The same bits as unsigned integers.
-///
-/// # Safety
-/// The CPU must have NEON.
-#[inline(always)]
-unsafe fn unsigned(a: [int32x4_t; 4]) -> [uint32x4_t; 4] {
-    // SAFETY: the caller promises NEON.
-    a.map(|a| unsafe { vreinterpretq_u32_s32(a) })
+macro_rules! unsigned {
+    ($x:expr) => {{
+        let x = $x;
+        quarters!(vreinterpretq_u32_s32(x))
+    }};
+}
+
+/// [`crate::quantised::requantise`].
+#[inline]
+#[target_feature(enable = "neon")]
+fn requantise(sum: int32x4_t, multiplier: int32x4_t) -> int32x4_t {
+    let low = vmull_s32(vget_low_s32(sum), vget_low_s32(multiplier));
+    vrshrn_high_n_s64::<32>(vrshrn_n_s64::<32>(low), vmull_high_s32(sum, multiplier))
 }
 
 impl Simd for Neon {
@@ -250,7 +254,10 @@ impl Simd for Neon {
     #[inline(always)]
     unsafe fn load_int_ptr(self, p: *const i32) -> Self::I {
         // SAFETY: the caller promises 16 readable integers at `p`; the token proves NEON.
-        unsafe { [0, 1, 2, 3].map(|q| vld1q_u32(p.add(q * QUARTER).cast())) }
+        unsafe {
+            let p = p.cast::<u32>();
+            [vld1q_u32(p), vld1q_u32(p.add(QUARTER)), vld1q_u32(p.add(2 * QUARTER)), vld1q_u32(p.add(3 * QUARTER))]
+        }
     }
     #[inline(always)]
     unsafe fn store_int_ptr(self, p: *mut i32, v: Self::I) {
@@ -261,24 +268,16 @@ impl Simd for Neon {
     }
     #[inline(always)]
     fn shift_right_signed(self, a: Self::I, bits: u32) -> Self::I {
-        // SAFETY: the token `self` proves that the CPU has NEON, whose left shift by a negative number is one to the right.
-        unsafe { unsigned(signed(a).map(|a| vshlq_s32(a, vdupq_n_s32(-bits.cast_signed())))) }
+        // A left shift by a negative number is one to the right.
+        // SAFETY: the token `self` proves that the CPU has NEON.
+        let left = unsafe { [vdupq_n_s32(-bits.cast_signed()); 4] };
+        let a = signed!(a);
+        unsigned!(quarters!(vshlq_s32(a, left)))
     }
     #[inline(always)]
     fn max_int(self, a: Self::I, b: Self::I) -> Self::I {
-        // SAFETY: the token `self` proves that the CPU has NEON.
-        unsafe {
-            let (a, b) = (signed(a), signed(b));
-            unsigned(quarters!(vmaxq_s32(a, b)))
-        }
-    }
-    #[inline(always)]
-    fn min_int(self, a: Self::I, b: Self::I) -> Self::I {
-        // SAFETY: the token `self` proves that the CPU has NEON.
-        unsafe {
-            let (a, b) = (signed(a), signed(b));
-            unsigned(quarters!(vminq_s32(a, b)))
-        }
+        let (a, b) = (signed!(a), signed!(b));
+        unsigned!(quarters!(vmaxq_s32(a, b)))
     }
     #[inline(always)]
     fn mul_short(self, a: Self::I, b: Self::I) -> Self::I {
@@ -286,25 +285,17 @@ impl Simd for Neon {
     }
     #[inline(always)]
     fn requantise(self, sum: Self::I, multiplier: Self::I) -> Self::I {
-        // SAFETY: the token `self` proves that the CPU has NEON.
-        unsafe {
-            let (sum, multiplier) = (signed(sum), signed(multiplier));
-            unsigned([0, 1, 2, 3].map(|q| {
-                let low = vmull_s32(vget_low_s32(sum[q]), vget_low_s32(multiplier[q]));
-                let high = vmull_high_s32(sum[q], multiplier[q]);
-                vrshrn_high_n_s64::<32>(vrshrn_n_s64::<32>(low), high)
-            }))
-        }
+        let (sum, multiplier) = (signed!(sum), signed!(multiplier));
+        unsigned!(quarters!(requantise(sum, multiplier)))
     }
     #[inline(always)]
     fn to_float(self, a: Self::I) -> Self::V {
-        // SAFETY: the token `self` proves that the CPU has NEON.
-        unsafe { signed(a).map(|a| vcvtq_f32_s32(a)) }
+        let a = signed!(a);
+        quarters!(vcvtq_f32_s32(a))
     }
     #[inline(always)]
     fn nearest(self, a: Self::V) -> Self::I {
-        // SAFETY: the token `self` proves that the CPU has NEON.
-        unsafe { unsigned(quarters!(vcvtnq_s32_f32(a))) }
+        unsigned!(quarters!(vcvtnq_s32_f32(a)))
     }
     #[inline(always)]
     unsafe fn load_bytes_ptr(self, p: *const i8) -> Self::B {
@@ -343,18 +334,20 @@ impl Simd for Neon {
     #[inline(always)]
     fn short_to_int(self, a: Self::H) -> Self::I {
         // SAFETY: the token `self` proves that the CPU has NEON.
-        unsafe {
-            let low = |a| vmovl_s16(vget_low_s16(a));
-            unsigned([low(a[0]), vmovl_high_s16(a[0]), low(a[1]), vmovl_high_s16(a[1])])
-        }
+        let quarters = unsafe {
+            let [a, b] = a;
+            let (low_a, low_b) = (vmovl_s16(vget_low_s16(a)), vmovl_s16(vget_low_s16(b)));
+            [low_a, vmovl_high_s16(a), low_b, vmovl_high_s16(b)]
+        };
+        unsigned!(quarters)
     }
     #[inline(always)]
     fn narrow(self, a: Self::I) -> Self::B {
+        let a = signed!(a);
         // SAFETY: the token `self` proves that the CPU has NEON.
         unsafe {
-            let a = signed(a);
-            let halves = [0, 2].map(|q| vqmovn_high_s32(vqmovn_s32(a[q]), a[q + 1]));
-            vqmovn_high_s16(vqmovn_s16(halves[0]), halves[1])
+            let (low, high) = (vqmovn_high_s32(vqmovn_s32(a[0]), a[1]), vqmovn_high_s32(vqmovn_s32(a[2]), a[3]));
+            vqmovn_high_s16(vqmovn_s16(low), high)
         }
     }
     #[inline(always)]

@@ -3,7 +3,7 @@
 use crate::gpu::Gpu;
 use crate::network::{self, Matrices, Stage};
 use crate::ops::Matrix;
-use crate::{Failure, operations};
+use crate::{Failure, operations, operations_i8};
 use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
@@ -131,7 +131,7 @@ impl Case {
     }
 }
 
-/// How far apart a stage may be, over the root mean square of what is expected.
+/// How far apart a stage may be, over the root mean square of what is expected. Integers must be equal, but for classes.
 #[derive(Clone, Copy, Debug)]
 pub struct Tolerance {
     /// The largest difference.
@@ -143,6 +143,9 @@ pub struct Tolerance {
 }
 
 impl Tolerance {
+    /// None.
+    pub const NONE: Self = Self { max: 0.0, rms: 0.0, classes: 1.0 };
+
     /// The tolerance called `name` in a manifest.
     ///
     /// # Errors
@@ -277,6 +280,17 @@ pub fn operation_stages(gpu: &Gpu) -> Vec<Stage> {
         bytes: values.iter().flat_map(|v| v.to_le_bytes()).collect(),
     };
     operations::results(gpu).into_iter().map(stage).collect()
+}
+
+/// Results of single operations on 8-bit tensors as stages of i32; values of f32 as their bits.
+pub fn operation_i8_stages(gpu: &Gpu) -> Vec<Stage> {
+    let stage = |(name, values): (String, Vec<i32>)| Stage {
+        name,
+        dtype: Dtype::I32,
+        shape: vec![values.len()],
+        bytes: values.iter().flat_map(|v| v.to_le_bytes()).collect(),
+    };
+    operations_i8::results(gpu).into_iter().map(stage).collect()
 }
 
 /// Reads stages from a safetensors file.

@@ -152,8 +152,12 @@ impl Gpu {
     }
 
     fn compile(&self, name: &str) -> wgpu::ComputePipeline {
-        let path = format!("{SHADERS}/{name}.wgsl");
-        let source = std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"));
+        let read = |name: &str| {
+            let path = format!("{SHADERS}/{name}.wgsl");
+            std::fs::read_to_string(&path).unwrap_or_else(|e| panic!("{path}: {e}"))
+        };
+        let rules = if name.ends_with("_i8") { read("quantised") } else { String::new() };
+        let source = rules + &read(name);
         let module = self.device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(name),
             source: wgpu::ShaderSource::Wgsl(source.into()),

@@ -6,7 +6,9 @@ pub mod cases;
 pub mod gpu;
 pub mod network;
 pub mod operations;
+pub mod operations_i8;
 pub mod ops;
+pub mod ops_i8;
 pub mod projection;
 
 use std::fmt;

@@ -87,10 +87,13 @@ fn dump(directory: &str, out: &str) -> Result<bool, Failure> {
 fn bless() -> Result<bool, Failure> {
     let gpu = Gpu::open()?;
     let own = cases::own();
-    let path = own.join("operations.safetensors");
-    let stages = cases::operation_stages(&gpu);
-    report("operations", &stages, cases::read_stages(&path).ok().as_deref());
-    cases::write_stages(&path, &stages)?;
+    for (name, stages) in
+        [("operations", cases::operation_stages(&gpu)), ("operations_i8", cases::operation_i8_stages(&gpu))]
+    {
+        let path = own.join(format!("{name}.safetensors"));
+        report(name, &stages, cases::read_stages(&path).ok().as_deref());
+        cases::write_stages(&path, &stages)?;
+    }
     let mut manifest = cases::manifest(&own)?;
     for (case, entry) in Case::listed(&own)?.iter().zip(manifest["cases"].as_array().into_iter().flatten()) {
         let left_out = entry["left_out"].as_array().into_iter().flatten().filter_map(Value::as_str);
@@ -108,8 +111,7 @@ fn bless() -> Result<bool, Failure> {
 
 /// Says how far the new stages are from those that were there.
 fn report(name: &str, stages: &[Stage], before: Option<&[Stage]>) {
-    let exact = Tolerance { max: 0.0, rms: 0.0, classes: 1.0 };
-    let changed = before.map(|before| cases::compare(stages, before, exact));
+    let changed = before.map(|before| cases::compare(stages, before, Tolerance::NONE));
     match changed {
         None => println!("{name}: {} stages, new", stages.len()),
         Some(Err(failure)) => println!("{name}: {} stages, of other shapes: {failure}", stages.len()),

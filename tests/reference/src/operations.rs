@@ -3,8 +3,12 @@
 use crate::gpu::Gpu;
 use crate::ops::{self, HeadWeights, Matrix, Norm, Tensor, Walk};
 
+#[path = "../../support/named.rs"]
+mod named;
 #[path = "../../support/operations.rs"]
 mod table;
+#[path = "../../support/operations_i8.rs"]
+pub(crate) mod table_i8;
 
 use table::{After, Case, Kind};
 

@@ -22,7 +22,7 @@ impl Tensor {
         Self::of(extent, channels, gpu.upload(values))
     }
 
-    fn of(extent: [usize; 3], channels: usize, buffer: Buffer) -> Self {
+    pub(crate) fn of(extent: [usize; 3], channels: usize, buffer: Buffer) -> Self {
         assert_eq!(buffer.len(), extent.iter().product::<usize>() * channels, "{extent:?} x {channels}");
         Self { extent, channels, buffer }
     }
@@ -68,7 +68,7 @@ impl Walk {
     /// One tap.
     pub const POINT: Self = Self { kernel: [1; 3], stride: [1; 3], dilation: [1; 3], padding: [0; 3] };
 
-    fn output(&self, extent: [usize; 3]) -> [usize; 3] {
+    pub(crate) fn output(&self, extent: [usize; 3]) -> [usize; 3] {
         std::array::from_fn(|a| {
             (extent[a] + 2 * self.padding[a] - self.dilation[a] * (self.kernel[a] - 1) - 1) / self.stride[a] + 1
         })
@@ -88,7 +88,7 @@ pub struct Norm {
     pub variance: Buffer,
 }
 
-fn words<const N: usize>(values: [usize; N]) -> [u32; N] {
+pub(crate) fn words<const N: usize>(values: [usize; N]) -> [u32; N] {
     values.map(|v| u32::try_from(v).expect("shapes fit 32 bits"))
 }
 
@@ -169,20 +169,32 @@ pub struct Matrix {
     pub col: Vec<u32>,
 }
 
+impl Matrix {
+    /// Both parts on the adapter.
+    pub(crate) fn upload(&self, gpu: &Gpu) -> [Buffer; 2] {
+        // A buffer has at least one number; a matrix may have no entry.
+        [gpu.upload(&self.ptr), if self.col.is_empty() { gpu.zeros(1) } else { gpu.upload(&self.col) }]
+    }
+}
+
 /// The mean of the features that each row names; `features` has the pixels of all cameras, camera by camera.
 pub fn gather(gpu: &Gpu, matrix: &Matrix, features: &[&Tensor], extent: [usize; 3]) -> Tensor {
     let (channels, pixels) = (features[0].channels, features[0].positions());
-    let all = gpu.zeros(features.len() * channels * pixels);
-    for (camera, tensor) in features.iter().enumerate() {
-        gpu.copy(&tensor.buffer, 0, &all, camera * channels * pixels, channels * pixels);
-    }
     let rows = extent.iter().product::<usize>();
     assert_eq!(matrix.ptr.len(), rows + 1, "a matrix of other rows");
-    let ptr = gpu.upload(&matrix.ptr);
-    // A buffer has at least one number; a matrix may have no entry.
-    let col = if matrix.col.is_empty() { gpu.zeros(1) } else { gpu.upload(&matrix.col) };
-    let buffer = gpu.run("gather", &words([channels, pixels, rows]), &[&ptr, &col, &all], rows * channels);
-    Tensor::of(extent, channels, buffer)
+    let [ptr, col] = matrix.upload(gpu);
+    let inputs = [&ptr, &col, &cameras(gpu, features)];
+    Tensor::of(extent, channels, gpu.run("gather", &words([channels, pixels, rows]), &inputs, rows * channels))
+}
+
+/// The features of all cameras in one buffer.
+pub(crate) fn cameras(gpu: &Gpu, features: &[&Tensor]) -> Buffer {
+    let len = features[0].len();
+    let all = gpu.zeros(features.len() * len);
+    for (camera, tensor) in features.iter().enumerate() {
+        gpu.copy(&tensor.buffer, 0, &all, camera * len, len);
+    }
+    all
 }
 
 /// `weight` is `[inputs, outputs, 4, 4, 4]`.

@@ -48,6 +48,15 @@ fn operations_are_regenerated() {
 }
 
 #[test]
+fn operations_on_bytes_are_regenerated_without_tolerance() {
+    let expected = cases::read_stages(&cases::own().join("operations_i8.safetensors")).unwrap();
+    let found = cases::operation_i8_stages(&gpu());
+    assert_eq!(found.len(), expected.len());
+    let rows = cases::compare(&found, &expected, Tolerance::NONE).unwrap();
+    assert!(rows.iter().all(|row| row.fits), "{}", table("8 bits", &rows));
+}
+
+#[test]
 fn networks_are_regenerated() {
     let own = cases::own();
     let manifest = cases::manifest(&own).unwrap();

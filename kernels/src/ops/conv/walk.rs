@@ -49,6 +49,13 @@ impl Geometry {
     }
 
     /// # Panics
+    /// If there is a third dimension.
+    pub(crate) fn check_flat(&self) {
+        let flat = [self.input[0], self.output[0], self.kernel[0]] == [1; 3] && self.padding[0] == 0;
+        assert!(flat, "a deformable convolution is two-dimensional");
+    }
+
+    /// # Panics
     /// If an extent is zero, a position cannot be counted, or `input` has another size.
     pub(crate) fn check<E>(&self, input: &[E]) {
         let extents = [self.input, self.kernel, self.stride, self.dilation];
@@ -211,12 +218,28 @@ impl<E: Copy + Default> Source for Walk<'_, E> {
 /// Copies equal lengths in pieces of known size: the runs are short, and a call per run would cost as much as the copy.
 #[inline(always)]
 fn copy<E: Copy>(from: &[E], to: &mut [E]) {
-    let (from_chunks, from_rest) = from.as_chunks::<LANES>();
-    let (to_chunks, to_rest) = to.as_chunks_mut();
-    for (from, to) in from_chunks.iter().zip(to_chunks) {
+    let rest = chunks::<E, LANES>(from, to);
+    if rest == 0 {
+        return;
+    }
+    // The last piece, once more where it overlaps.
+    if let (Some(from), Some(to)) = (from.last_chunk::<LANES>(), to.last_chunk_mut()) {
+        *to = *from;
+        return;
+    }
+    let rest = chunks::<E, GROUP>(from, to);
+    let start = from.len() - rest;
+    for (from, to) in from[start..].iter().zip(&mut to[start..]) {
         *to = *from;
     }
-    for (from, to) in from_rest.iter().zip(to_rest) {
+}
+
+/// Copies what makes whole pieces of `N`. Returns how many elements are left.
+#[inline(always)]
+fn chunks<E: Copy, const N: usize>(from: &[E], to: &mut [E]) -> usize {
+    let (from, rest) = from.as_chunks::<N>();
+    for (from, to) in from.iter().zip(to.as_chunks_mut().0) {
         *to = *from;
     }
+    rest.len()
 }

@@ -20,7 +20,7 @@ pub(crate) fn draw(draw: &mut Draw) -> Option<impl Case + use<>> {
     let (rows, channels) = (draw.extent(1, 300), draw.extent(1, 150));
     let (offset, stride) = (draw.extent(0, 5), channels + 5 + draw.extent(0, 5));
     let factor = draw.int_within(0, MAX_FACTOR);
-    let (input, before) = (draw.int8s(rows * channels), draw.int8s(rows * stride));
+    let (input, before) = (draw.int8s(rows * channels), draw.int8s(3 * stride));
     Some(Call { channels, offset, stride, factor, input, before })
 }
 

@@ -1,6 +1,6 @@
 //! [`super::normalise_i8()`] with any arguments, and at the network's shapes.
 
-use super::{MAX_FACTOR, MAX_OFFSET, NormaliseI8, normalise_i8};
+use super::{FRACTION, MAX_FACTOR, MAX_OFFSET, NormaliseI8, normalise_i8};
 use crate::cases::{Bench, Case, Draw, Memory, Output};
 use crate::isa::Isa;
 use std::ops::Range;
@@ -20,9 +20,11 @@ pub(crate) fn draw(draw: &mut Draw) -> Option<impl Case + use<>> {
     let (height, width) = (draw.extent(0, 12), draw.extent(0, 40));
     let padded_height = height + draw.extent(0, 4);
     let padded_width = (width + draw.extent(0, 9)).max(1);
+    // Anything, or what keeps most bytes apart.
+    let [factor, offset] = if draw.flag() { [MAX_FACTOR, MAX_OFFSET] } else { [1 << FRACTION, 127 << FRACTION] };
     let args = NormaliseI8 {
-        factors: core::array::from_fn(|_| draw.int_within(0, MAX_FACTOR)),
-        offsets: core::array::from_fn(|_| draw.int_within(-MAX_OFFSET, MAX_OFFSET)),
+        factors: core::array::from_fn(|_| draw.int_within(factor / 4, factor)),
+        offsets: core::array::from_fn(|_| draw.int_within(-offset, offset / 2)),
     };
     let image = draw.int8s(height * width * 3).into_iter().map(i8::cast_unsigned).collect();
     Some(Call { height, width, padded_width, rows: draw.rows(padded_height), args, image })
