@@ -8,12 +8,16 @@ use voxcast::Isa;
 use voxcast_kernels::LANES;
 use voxcast_kernels::conv::Geometry;
 use voxcast_kernels::conv_i8::{ConvI8, conv_i8, conv_i8_wide};
+use voxcast_kernels::deconv3d::kernel_tap;
+use voxcast_kernels::deconv3d_i8::{Deconv3dI8, deconv3d_i8};
+use voxcast_kernels::deform_conv2d_i8::{DeformConv2dI8, deform_conv2d_i8};
 use voxcast_kernels::depthwise::Depthwise;
 use voxcast_kernels::depthwise_i8::{DepthwiseI8, depthwise_i8};
 use voxcast_kernels::dequantise::dequantise;
 use voxcast_kernels::gate_i8::{GateI8, gate_i8};
 use voxcast_kernels::gather::Gather;
 use voxcast_kernels::gather_i8::{self, gather_i8};
+use voxcast_kernels::head_i8::{HeadI8, LayerI8, head_i8};
 use voxcast_kernels::max_pool::MaxPool;
 use voxcast_kernels::max_pool_i8::max_pool_i8;
 use voxcast_kernels::mean_i8::{self, mean_i8};
@@ -122,6 +126,9 @@ impl Run<'_> {
                 channels_first(&out, 4)
             }
             Kind::Conv(conv) => self.conv(&conv),
+            Kind::DeformConv { .. } => self.deform_conv(),
+            Kind::Deconv { .. } => self.deconv(),
+            Kind::Head { voxels, channels, classes } => self.head(voxels, channels, classes),
             Kind::Depthwise { height, width, channels, side, residual } => {
                 self.depthwise([height, width], channels, side, residual)
             }
@@ -205,6 +212,94 @@ impl Run<'_> {
         let mut out = vec![JUNK; positions * outputs];
         conv_i8(self.isa, &args, 0..positions, outputs, &mut out, &mut right.scratch());
         channels_first(&out, outputs)
+    }
+
+    fn deform_conv(&self) -> Vec<i32> {
+        let Kind::DeformConv { height, width, inputs, outputs, reach, after } = self.case.kind else { unreachable!() };
+        let (extent, positions) = ([1, height, width], height * width);
+        let geometry = Geometry {
+            input: extent,
+            channels: inputs,
+            kernel: [1, 3, 3],
+            stride: [1; 3],
+            dilation: [1; 3],
+            padding: [0, 1, 1],
+            output: extent,
+        };
+        let right = self.right([geometry.depth(), outputs], after, inputs);
+        let residual = self.residual(after, positions, outputs);
+        let args = DeformConv2dI8 {
+            geometry,
+            input: &self.rows("x", positions, inputs, true),
+            offsets: &channels_last(&self.case.offsets(positions, reach), 27),
+            product: right.product(true, &residual),
+        };
+        let mut out = vec![JUNK; positions * outputs];
+        deform_conv2d_i8(self.isa, &args, 0..positions, outputs, &mut out, &mut right.scratch());
+        channels_first(&out, outputs)
+    }
+
+    fn deconv(&self) -> Vec<i32> {
+        let Kind::Deconv { extent, inputs, outputs, after } = self.case.kind else { unreachable!() };
+        let (depth, weight) = (8 * inputs, self.case.elements("weight", inputs * outputs * 64, true));
+        let parity = |parity: usize| {
+            Right::new([depth, outputs], after, self.case.columns("columns", depth, outputs), |k, n| {
+                let (tap, c) = (k / inputs, k % inputs);
+                let bits = |v: usize| [v >> 2 & 1, v >> 1 & 1, v & 1];
+                let axes = bits(parity).into_iter().zip(bits(tap));
+                weight[axes.fold(c * outputs + n, |at, (parity, tap)| at * 4 + kernel_tap(parity, tap))]
+            })
+        };
+        let parities: Vec<Right> = (0..8).map(parity).collect();
+        let Columns { bias, multiplier, residual: joins } = &parities[0].columns;
+        let positions = 8 * extent.iter().product::<usize>();
+        let residual = self.residual(after, positions, outputs);
+        let args = Deconv3dI8 {
+            extent,
+            channels: inputs,
+            columns: outputs,
+            input: &self.rows("x", positions / 8, inputs, true),
+            signed: true,
+            weights: &parities.iter().flat_map(|p| p.weights.clone()).collect::<Vec<_>>(),
+            sums: &parities.iter().flat_map(|p| p.sums.clone()).collect::<Vec<_>>(),
+            pairs: &parities.iter().flat_map(|p| p.pairs.clone()).collect::<Vec<_>>(),
+            bias,
+            relu: after.relu(),
+            add: after.adds().then_some((&residual[..], &joins[..])),
+            multiplier,
+        };
+        let mut out = vec![JUNK; positions * outputs];
+        deconv3d_i8(self.isa, &args, 0..2 * extent[0], &mut out, &mut parities[0].scratch());
+        channels_first(&out, outputs)
+    }
+
+    /// The logits, as sums, and the classes.
+    fn head(&self, voxels: usize, channels: usize, classes: usize) -> Vec<i32> {
+        let layer = |i: usize, outputs: usize| {
+            let weight = self.case.elements(&format!("{i}.weight"), outputs * channels, true);
+            let columns = self.case.columns(&format!("{i}.columns"), channels, outputs);
+            Right::new([channels, outputs], After::Relu, columns, |k, n| weight[n * channels + k])
+        };
+        let layers = [layer(0, channels), layer(1, channels), layer(2, classes)];
+        let args = HeadI8 {
+            input: &self.rows("x", voxels, channels, true),
+            signed: true,
+            channels,
+            classes,
+            layers: layers.each_ref().map(|right| LayerI8 {
+                weights: &right.weights,
+                sums: &right.sums,
+                pairs: &right.pairs,
+                bias: &right.columns.bias,
+            }),
+            multipliers: [0, 1].map(|i| &layers[i].columns.multiplier[..]),
+            // Logits that are the sums, to 24 bits.
+            scale: 1.0,
+        };
+        let (mut found, mut logits) = (vec![0; voxels], vec![f32::NAN; voxels * classes]);
+        let mut scratch = vec![JUNK.into(); voxcast_kernels::head_i8::scratch_len(channels, classes)];
+        head_i8(self.isa, &args, 0..voxels, &mut found, Some(&mut logits), &mut scratch);
+        logits.iter().map(|&logit| logit as i32).chain(found.into_iter().map(i32::from)).collect()
     }
 
     /// Weights `[outputs, inputs, taps]`, with k over (tap, input).
@@ -303,12 +398,16 @@ fn expected() -> BTreeMap<String, Vec<i32>> {
 fn kernels_equal_the_reference() {
     let (expected, table) = (expected(), table());
     for case in &table {
-        let want = &expected[&case.name];
+        let mut want = expected[&case.name].clone();
+        if matches!(case.kind, Kind::Head { .. }) {
+            // Logits are the nearest f32 to sums.
+            want.iter_mut().for_each(|v| *v = *v as f32 as i32);
+        }
         for isa in Isa::available() {
             let found = Run { case, isa }.result();
             assert_eq!(found.len(), want.len(), "{}", case.name);
-            let differ = found.iter().zip(want).filter(|(a, b)| a != b).count();
-            let first = found.iter().zip(want).position(|(a, b)| a != b);
+            let differ = found.iter().zip(&want).filter(|(a, b)| a != b).count();
+            let first = found.iter().zip(&want).position(|(a, b)| a != b);
             let pair = first.map(|i| (i, found[i], want[i]));
             assert_eq!(pair, None, "{} on {}: {differ} of {} differ", case.name, isa.name(), want.len());
         }

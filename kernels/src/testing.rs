@@ -1,5 +1,7 @@
 //! What the kernels' tests share: values to compute with, and comparisons that name the place of a difference.
 
+pub(crate) mod int8;
+
 use crate::matmul::layout::{pack, packed_len};
 use crate::matmul::{Panels, Product, Residual};
 use half::f16;
@@ -279,19 +281,45 @@ pub(crate) fn round_to(half: bool, mut x: Vec<f32>) -> Vec<f32> {
     x
 }
 
+/// A value that a test finds again between the rows of an output.
+pub(crate) trait Gap: Copy {
+    const GAP: Self;
+    fn is_gap(self) -> bool;
+}
+
+impl Gap for f32 {
+    const GAP: Self = f32::from_bits(0x7fc0_0bad);
+    fn is_gap(self) -> bool {
+        self.to_bits() == Self::GAP.to_bits()
+    }
+}
+
+impl Gap for i8 {
+    const GAP: Self = i8::MIN;
+    fn is_gap(self) -> bool {
+        self == Self::GAP
+    }
+}
+
+impl Gap for i32 {
+    const GAP: Self = 0x0bad_0bad;
+    fn is_gap(self) -> bool {
+        self == Self::GAP
+    }
+}
+
 /// Runs `write` on `rows` rows of values, `stride` apart, which hold `before`. Returns what they hold afterwards, densely;
 /// the values in between must be left alone.
-pub(crate) fn write_rows(rows: usize, stride: usize, before: &[f32], write: impl FnOnce(&mut [f32])) -> Vec<f32> {
-    let gap = f32::from_bits(0x7fc0_0bad);
+pub(crate) fn write_rows<T: Gap>(rows: usize, stride: usize, before: &[T], write: impl FnOnce(&mut [T])) -> Vec<T> {
     let columns = before.len().checked_div(rows).unwrap_or(0);
-    let mut out = vec![gap; rows * stride];
+    let mut out = vec![T::GAP; rows * stride];
     for row in 0..rows {
         out[row * stride..][..columns].copy_from_slice(&before[row * columns..][..columns]);
     }
     let end = out.len().saturating_sub(stride - columns);
     write(&mut out[..end]);
     for (i, v) in out.iter().enumerate() {
-        assert!(i % stride < columns || v.to_bits() == gap.to_bits(), "value {i}, between rows, was written");
+        assert!(i % stride < columns || v.is_gap(), "value {i}, between rows, was written");
     }
     out.chunks(stride.max(1)).flat_map(|row| &row[..columns]).copied().collect()
 }

@@ -55,4 +55,4 @@ mod walk;
 #[cfg(feature = "cases")]
 pub(crate) mod cases;
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

@@ -12,8 +12,9 @@
 //! ```
 //!
 //! A corner outside the image has weight 0. The weights of a sample are at most 2^14 + 2 together, so its sum stays far inside
-//! i32. Positions are computed in 64 bits, so any offset will do. Against exact arithmetic on the same integers a weight is
-//! off by 1/2 (the table's rounding of the sigmoid by 8 more), so a sample by at most `127 * 4 * 8.5 / 2^14 + 1/2 < 0.77`.
+//! i32. Positions are computed in 64 bits, so any offset will do. Against exact arithmetic on the same integers the weights are
+//! off by 8 together for the table's rounding, and by 1/2 each for their own, so a sample by at most
+//! `127 * (8 + 4 / 2) / 2^14 + 1/2 < 0.58`.
 
 use crate::isa::Isa;
 use crate::matmul::ProductI8;

@@ -15,7 +15,7 @@ fn output(input: [usize; 3], g: &Geometry) -> [usize; 3] {
     })
 }
 
-fn geometry(
+pub(crate) fn geometry(
     input: [usize; 3],
     channels: usize,
     kernel: [usize; 3],
@@ -39,16 +39,12 @@ struct Case {
 impl Case {
     fn new(geometry: Geometry, columns: usize, way: Way, seed: u64, fill: Fill) -> Self {
         let mut rng = Rng::new(seed);
-        let Geometry { channels, kernel: [_, kh, kw], .. } = geometry;
         let depth = geometry.depth();
         let natural = round_to(way.half, fill(&mut rng, columns * depth));
         let bias = fill(&mut rng, columns);
-        let owned = Owned::new(depth, &bias, way.half, |k, n| {
-            let (tap, c) = (k / channels, k % channels);
-            natural[n * depth + c * (depth / channels) + (tap / (kh * kw) * kh + tap / kw % kh) * kw + tap % kw]
-        });
+        let owned = Owned::new(depth, &bias, way.half, |k, n| natural[n * depth + natural_index(&geometry, k)]);
         let owned = owned.end(&mut rng, fill, geometry.rows(), way.joins, 1, way.relu);
-        let input = fill(&mut rng, geometry.input.iter().product::<usize>() * channels);
+        let input = fill(&mut rng, geometry.input.iter().product::<usize>() * geometry.channels);
         let before = fill(&mut rng, geometry.rows() * columns);
         Self { geometry, input, owned, before, natural }
     }
@@ -65,42 +61,57 @@ impl Case {
         self.rows(isa, 0..self.geometry.rows())
     }
 
-    /// The formula in f64, on tensors in PyTorch's layouts: `[channels, d, h, w]` and `[columns, channels, kernel]`.
+    /// The formula in f64.
     fn naive(&self) -> Vec<f64> {
-        let Geometry { input: [d, h, w], channels, kernel, stride, dilation, padding, .. } = self.geometry;
-        let [kd, kh, kw] = kernel;
-        let mut image = vec![0.0; self.input.len()];
-        for (i, x) in self.input.iter().enumerate() {
-            image[i % channels * (d * h * w) + i / channels] = f64::from(*x);
-        }
-        let mut out = Vec::new();
-        for (row, n) in (0..self.geometry.rows()).flat_map(|row| (0..self.owned.columns).map(move |n| (row, n))) {
-            let [_, oh, ow] = self.geometry.output;
-            let position = [row / ow / oh, row / ow % oh, row % ow];
-            let mut sum = 0.0;
-            for (i, weight) in self.natural[n * channels * kd * kh * kw..][..channels * kd * kh * kw].iter().enumerate()
-            {
-                let (c, tap) = (i / (kd * kh * kw), [i / (kh * kw) % kd, i / kw % kh, i % kw]);
-                let at: [isize; 3] = std::array::from_fn(|i| {
-                    (position[i] * stride[i] + tap[i] * dilation[i]) as isize - padding[i] as isize
-                });
-                if (0..3).all(|i| at[i] >= 0 && at[i] < self.geometry.input[i] as isize) {
-                    let [z, y, x] = at.map(|v| v as usize);
-                    sum += image[((c * d + z) * h + y) * w + x] * f64::from(*weight);
-                }
-            }
-            out.push(self.owned.naive_end(row, n, self.before[row * self.owned.columns + n], sum));
-        }
-        out
+        let wide = |x: &[f32]| x.iter().copied().map(f64::from).collect::<Vec<_>>();
+        let columns = self.owned.columns;
+        let sums = naive_sums(&self.geometry, &wide(&self.input), &wide(&self.natural), columns);
+        let end = |(i, sum)| self.owned.naive_end(i / columns, i % columns, self.before[i], sum);
+        sums.into_iter().enumerate().map(end).collect()
     }
 }
 
+/// The sums of products, on tensors in PyTorch's layouts: `[channels, d, h, w]` and `[columns, channels, kernel]`.
+pub(crate) fn naive_sums(geometry: &Geometry, input: &[f64], natural: &[f64], columns: usize) -> Vec<f64> {
+    let Geometry { input: [d, h, w], channels, kernel, stride, dilation, padding, .. } = *geometry;
+    let [kd, kh, kw] = kernel;
+    let mut image = vec![0.0; input.len()];
+    for (i, x) in input.iter().enumerate() {
+        image[i % channels * (d * h * w) + i / channels] = *x;
+    }
+    let mut out = Vec::new();
+    for (row, n) in (0..geometry.rows()).flat_map(|row| (0..columns).map(move |n| (row, n))) {
+        let [_, oh, ow] = geometry.output;
+        let position = [row / ow / oh, row / ow % oh, row % ow];
+        let mut sum = 0.0;
+        for (i, weight) in natural[n * channels * kd * kh * kw..][..channels * kd * kh * kw].iter().enumerate() {
+            let (c, tap) = (i / (kd * kh * kw), [i / (kh * kw) % kd, i / kw % kh, i % kw]);
+            let at: [isize; 3] = std::array::from_fn(|i| {
+                (position[i] * stride[i] + tap[i] * dilation[i]) as isize - padding[i] as isize
+            });
+            if (0..3).all(|i| at[i] >= 0 && at[i] < geometry.input[i] as isize) {
+                let [z, y, x] = at.map(|v| v as usize);
+                sum += image[((c * d + z) * h + y) * w + x] * weight;
+            }
+        }
+        out.push(sum);
+    }
+    out
+}
+
+/// Which of PyTorch's weights `[channels, kernel]` of a column is multiplied at `k`.
+pub(crate) fn natural_index(geometry: &Geometry, k: usize) -> usize {
+    let Geometry { channels, kernel: [_, kh, kw], .. } = *geometry;
+    let (tap, c) = (k / channels, k % channels);
+    c * (geometry.depth() / channels) + (tap / (kh * kw) * kh + tap / kw % kh) * kw + tap % kw
+}
+
 /// Three numbers per axis-triple are spelled out only where they differ.
-const ONE: [usize; 3] = [1; 3];
+pub(crate) const ONE: [usize; 3] = [1; 3];
 
 /// (name, geometry, columns). Tiles, panels and blocks of k are straddled in every kind of convolution, and the first and
 /// second axes always differ.
-fn table() -> Vec<(&'static str, Geometry, usize)> {
+pub(crate) fn table() -> Vec<(&'static str, Geometry, usize)> {
     let flat = |h, w| [1, h, w];
     let g = geometry;
     vec![
