@@ -83,12 +83,13 @@ fn everything_is_allocated_when_a_session_is_made_and_known_before() {
     assert_eq!((calls, bytes), (2, 100), "the counter counts");
     let (kept, bytes, calls) = held(|| std::hint::black_box(vec![0u8; 100]));
     assert_eq!((kept.len(), bytes, calls), (100, 100, 1), "what is held is counted");
-    let mut network = small::network();
-    network.image = [32, 64];
-    network.grids = [[8, 12, 4], [4, 6, 2], [2, 3, 1]];
-    let images = Images::new(&network, 5);
-    let images = images.views();
-    for (precision, rewrites) in [(Precision::F32, Rewrites::ALL), (Precision::F16, Rewrites::NONE)] {
+    let stored = [(Precision::F32, Rewrites::ALL), (Precision::F16, Rewrites::NONE), (Precision::I8, Rewrites::ALL)];
+    for (precision, rewrites) in stored {
+        let mut network = small::suited(small::network(), precision);
+        network.image = [32, 64];
+        network.grids = [[8, 12, 4], [4, 6, 2], [2, 3, 1]];
+        let images = Images::new(&network, 5);
+        let images = images.views();
         opening_takes_the_same_each_time(&network, precision, rewrites);
         let model = small::model(&network, precision, rewrites, 1);
         for threads in [1, 2, 3] {

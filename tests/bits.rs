@@ -60,11 +60,17 @@ fn tiny() -> Network {
 
 #[test]
 fn isa_threads_repetition_company_and_rig_swaps_do_not_show() {
-    let network = tiny();
-    let (rig, other_rig) = (small::rig(&network, 0.3), small::rig(&network, 1.0));
-    let images = Images::new(&network, 5);
-    let stored = [(Precision::F32, Rewrites::ALL), (Precision::F32, Rewrites::NONE), (Precision::F16, Rewrites::ALL)];
+    let stored = [
+        (Precision::F32, Rewrites::ALL),
+        (Precision::F32, Rewrites::NONE),
+        (Precision::F16, Rewrites::ALL),
+        (Precision::I8, Rewrites::ALL),
+        (Precision::I8, Rewrites { projection: false, ..Rewrites::ALL }),
+    ];
     for (precision, rewrites) in stored {
+        let network = small::suited(tiny(), precision);
+        let (rig, other_rig) = (small::rig(&network, 0.3), small::rig(&network, 1.0));
+        let images = Images::new(&network, 5);
         let model = small::model(&network, precision, rewrites, 1);
         let images = images.views();
         let expected = run(&mut session(&model, &rig, Isa::Scalar, Threads::calling()), &images);

@@ -58,7 +58,7 @@ struct Bench {
 
 impl Bench {
     fn new(precision: Precision, rewrites: Rewrites) -> Self {
-        let network = network();
+        let network = small::suited(network(), precision);
         let model = small::model(&network, precision, rewrites, 1);
         let rigs = [0.3, 1.0].map(|turn| small::rig(&network, turn));
         let images = [5, 6, 7].map(|seed| Images::new(&network, seed));
@@ -102,7 +102,8 @@ fn finish(session: &mut Session, budget: Budget) -> usize {
 #[test]
 fn slices_and_the_order_of_cameras_do_not_show() {
     let orders = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
-    for (precision, rewrites) in [(Precision::F32, Rewrites::ALL), (Precision::F16, Rewrites::NONE)] {
+    let stored = [(Precision::F32, Rewrites::ALL), (Precision::F16, Rewrites::NONE), (Precision::I8, Rewrites::ALL)];
+    for (precision, rewrites) in stored {
         let bench = Bench::new(precision, rewrites);
         let expected = bench.whole([0, 0, 0], [false; 3], 0);
         let mut turns = orders.iter().cycle();

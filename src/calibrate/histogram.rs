@@ -47,7 +47,9 @@ impl Histogram {
         self.max = self.max.max(max);
         let max = f64::from(max);
         if self.limit == 0.0 && max > 0.0 {
-            self.limit = 2.0f64.powi(max.log2().floor() as i32);
+            // The power of two in its exponent.
+            let power = f32::from_bits((max as f32).to_bits() & f32::INFINITY.to_bits());
+            self.limit = f64::from(power.max(f32::MIN_POSITIVE));
         }
         while max > 0.0 && max >= self.limit {
             self.limit *= 2.0;
@@ -89,7 +91,7 @@ impl Histogram {
 fn squares(x: f64, step: f64) -> f64 {
     let level = (x / step + 0.5).floor().min(LEVELS);
     let rest = x - level * step;
-    level * step.powi(3) / 12.0 + rest.powi(3) / 3.0
+    level * (step * step * step) / 12.0 + rest * rest * rest / 3.0
 }
 
 #[cfg(test)]

@@ -1,8 +1,10 @@
 //! Calibration: what range each tensor of a network takes on scenes, from which int8 models are made.
 
 mod histogram;
+mod mixed;
 
 pub use histogram::Histogram;
+pub use mixed::{Choice, Mixed};
 
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::base::note::Note;

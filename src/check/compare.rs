@@ -313,6 +313,8 @@ mod tests {
         let Outcome::Differs(found) = &stages[1].outcome else { panic!("{:?}", stages[1]) };
         assert_eq!((found.count, found.max, found.at.as_slice(), found.values), (1, 0.5, &[0, 1, 0][..], [3.5, 3.0]));
         assert!((found.relative - 0.5 / 7.5f64.sqrt()).abs() < 1e-12 && found.ulp == Some(1 << 21) && found.beyond);
+        // The square of 0.5 in those of 1, 2, 3, 4.
+        assert!((found.snr.expect("floats") - 10.0 * (30.0f64 / 0.25).log10()).abs() < 1e-9);
         let within = compare(&a, &b, Some(0.2), false).expect("comparable");
         assert!(!within[1].diverges() && within[2].diverges());
     }

@@ -72,6 +72,12 @@ pub fn measure(model: &Arc<Model>, names: &[String], frames: u32, (isa, threads)
     calibrator.ranges()
 }
 
+/// `count` of the scenes and sets of these names.
+pub fn some(names: &[String], count: usize, network: &Network) -> Result<Vec<Scene>> {
+    let scenes = Scenes::open(names)?;
+    spread(scenes.len(), count).map(|index| Ok(scenes.read(index, network)?.0)).collect()
+}
+
 /// Frames without regard to labels, one after the other.
 pub struct Scenes(Vec<Source>);
 

@@ -7,14 +7,23 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use voxcast::eval::Confusion;
+use voxcast::graph::Rewrites;
+use voxcast::import::{Integers, import, import_int8};
+use voxcast::model::Options;
+use voxcast::model::ranges::Ranges;
+use voxcast::model::unpacked::Unpacked;
 use voxcast::network::Grid;
 use voxcast::picture::{self, Figure, Palette};
 use voxcast::session::{Occupancy, views};
 use voxcast::synth::{CLASSES, Frame, Synthesiser};
-use voxcast::{Error, Model, Network, Result, Session};
+use voxcast::weights::Precision;
+use voxcast::{Error, Model, Network, Result, Session, SessionOptions};
 
 /// The trained network that ships with the program (`docs/model-card.md`).
 static EDGE: &[u8] = include_bytes!("../../assets/edge.safetensors");
+
+/// The ranges of its tensors, measured on drawn streets (`docs/int8.md`).
+static EDGE_RANGES: &str = include_str!("../../assets/edge.ranges.json");
 
 /// Draw a street, run the network that ships with the program on it, and show what it made of it beside the truth.
 ///
@@ -25,6 +34,7 @@ static EDGE: &[u8] = include_bytes!("../../assets/edge.safetensors");
 Examples:
   voxcast demo -o demo-out
   voxcast demo -o demo-out --seed 1000007              (another street)
+  voxcast demo -o demo-out --precision int8            (sums in integers: faster, and exact)
   voxcast demo -o demo-out --threads 1                 (the same digest as with any other number of threads)
   voxcast demo -o demo-out --threads 1 --isa scalar    (the same digest again)
 
@@ -34,6 +44,10 @@ pub struct Demo {
     /// Directory for scene/, model, rig, occupancy, picture and page
     #[arg(short, long, value_name = "DIR", default_value = "voxcast-demo")]
     output: PathBuf,
+    /// Precision of the network: f16 as it ships, or f32 or int8 made of that
+    #[arg(long, default_value = "f16", value_parser = ["f32", "f16", "int8", "i8"], hide_possible_values = true,
+        value_name = "f32|f16|int8")]
+    precision: String,
     /// Which street is drawn; the network was trained on 0 to 2419
     #[arg(long, default_value_t = 1_000_006)]
     seed: u64,
@@ -48,7 +62,7 @@ impl Demo {
         let options = frame::options(&self.machine)?;
 
         let model_path = directory.join("model.safetensors");
-        voxcast::model::write_bytes(&model_path, EDGE)?;
+        write_model(&model_path, Precision::parse(&self.precision).unwrap_or(Precision::F16), &options)?;
         let model = Arc::new(Model::open(&model_path)?);
         let network = model.network();
         let start = Instant::now();
@@ -95,6 +109,24 @@ impl Demo {
         );
         Ok(())
     }
+}
+
+/// Writes the network that ships with the program in a precision.
+fn write_model(path: &Path, precision: Precision, options: &SessionOptions) -> Result<()> {
+    voxcast::model::write_bytes(path, EDGE)?;
+    if precision == Precision::F16 {
+        return Ok(());
+    }
+    let shipped = Model::from_bytes(EDGE)?;
+    let (source, network, rewrites) = (Unpacked::new(&shipped)?, shipped.network(), Rewrites::ALL);
+    if precision == Precision::I8 {
+        let ranges = Ranges::from_json(EDGE_RANGES, network)?;
+        let integers = Integers { rewrites, ranges: &ranges, keep_f32: &[] };
+        import_int8(&source, network, &integers, path, &mut |_, _| ())?;
+    } else {
+        import(&source, network, Options { precision, rewrites }, path, &mut |_, _| ())?;
+    }
+    voxcast::selftest::record(path, options.isa, &options.threads)
 }
 
 /// How much of this one street is right, of all voxels and of those that a camera sees.

@@ -4,6 +4,7 @@ use super::{ThreadCount, calibrate, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use voxcast::calibrate::Mixed;
 use voxcast::checkpoint::Checkpoint;
 use voxcast::container::Container;
 use voxcast::graph::Rewrites;
@@ -24,6 +25,7 @@ Examples:
   voxcast import weights.safetensors --network network.json --precision f16 -o model.safetensors
   voxcast import epoch_24.pth --network nuscenes-200 --precision int8 --calibrate scenes/* -o int8.safetensors
   voxcast import model.safetensors --precision int8 --calibrate synthetic:train -o int8.safetensors
+  voxcast import model.safetensors --precision int8 --calibrate synthetic:train --auto-mixed 30 -o int8.safetensors
   voxcast import model.safetensors --precision int8 --ranges ranges.json --keep-f32 img_backbone.layer1 -o int8.safetensors
 
 A .pth file, of either format that torch.save writes, is read without executing anything: it may hold tensors and plain
@@ -56,6 +58,10 @@ pub struct Import {
     /// Operations of an int8 model that stay in f32: names, or the start of names up to a dot
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     keep_f32: Vec<String>,
+    /// Keep the fewest operations of an int8 model in f32 with which the logits' ratio of signal to noise is at least DB
+    /// decibels, measured on two of the frames of --calibrate
+    #[arg(long, value_name = "DB", requires = "calibrate")]
+    auto_mixed: Option<f64>,
     /// Rewrites applied to the network: all, batch-norm (keeps the pyramid's features), none (keeps batch norms too)
     #[arg(long, default_value = "all", value_parser = ["all", "batch-norm", "none"])]
     fold: String,
@@ -68,6 +74,9 @@ pub struct Import {
     #[command(flatten)]
     threads: ThreadCount,
 }
+
+/// Frames on which precisions are mixed.
+const MIXED_FRAMES: usize = 2;
 
 impl Import {
     pub fn run(self) -> Result<()> {
@@ -139,7 +148,11 @@ impl Import {
                 voxcast::import::import(source, network, options, &self.output, progress)
             }
             Some(ranges) => {
-                let integers = Integers { rewrites, ranges, keep_f32: &self.keep_f32 };
+                let keep_f32 = match self.auto_mixed {
+                    Some(target) => self.mix(source, network, ranges, target)?,
+                    None => self.keep_f32.clone(),
+                };
+                let integers = Integers { rewrites, ranges, keep_f32: &keep_f32 };
                 voxcast::import::import_int8(source, network, &integers, &self.output, progress)
             }
         }
@@ -164,6 +177,25 @@ impl Import {
             model.checksum().unwrap_or_default()
         );
         Ok(())
+    }
+
+    /// The operations to keep in f32 so that the logits are as close to those of f32 as `target` asks.
+    fn mix(&self, source: &dyn Source, network: &Network, ranges: &Ranges, target: f64) -> Result<Vec<String>> {
+        let scenes = calibrate::some(&self.calibrate, MIXED_FRAMES, network)?;
+        let integers = Integers { rewrites: self.rewrites(), ranges, keep_f32: &self.keep_f32 };
+        let threads = self.threads.threads()?;
+        let mixed = Mixed::new(source, network, integers, &scenes, (Isa::best(), &threads))?;
+        let bar = terminal::progress("mixing", mixed.runs());
+        let choice = mixed.find(target, &mut |done| bar.set_position(done as u64))?;
+        bar.finish_and_clear();
+        println!(
+            "logits at {:.1} dB, {} operations in f32 (all int8: {:.1} dB): {}",
+            choice.snr,
+            choice.keep_f32.len(),
+            choice.least,
+            choice.keep_f32.join(",")
+        );
+        Ok(choice.keep_f32)
     }
 
     /// The ranges from their file, or measured with the weights in f32.

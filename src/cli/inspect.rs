@@ -4,7 +4,7 @@ use super::{ThreadCount, terminal};
 use clap::Args;
 use std::path::PathBuf;
 use voxcast::container::Container;
-use voxcast::graph::Results;
+use voxcast::graph::{Element, Graph, Operation, Results, Tensor};
 use voxcast::{Error, Model, Network, Result, Rig, Session, SessionOptions};
 
 /// Say what is in a model or a rig: shapes, precisions, sizes, the memory a session takes, checksum.
@@ -13,6 +13,7 @@ use voxcast::{Error, Model, Network, Result, Rig, Session, SessionOptions};
 Examples:
   voxcast inspect model.safetensors
   voxcast inspect model.safetensors --plan --cameras 1 --threads 4
+  voxcast inspect int8.safetensors --operations    (which operations compute in f32?)
   voxcast inspect rig.safetensors --json")]
 pub struct Inspect {
     /// A model or a rig
@@ -20,7 +21,7 @@ pub struct Inspect {
     /// Cameras that a model's session is sized for [default: as the network says]
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=64))]
     cameras: Option<u16>,
-    /// Also print every operation of a model
+    /// Also print every operation of a model: kind, elements read and written, shape, bytes, work
     #[arg(long)]
     operations: bool,
     /// Also print where every tensor of a model lies in the arena
@@ -59,11 +60,15 @@ impl Inspect {
             })
             .fold(0, u64::saturating_add);
         let rewrites = model.options().rewrites;
+        let kept = kept(&model, &graph);
+        let operations: Vec<Row<'_>> =
+            graph.operations.iter().map(|operation| Row::new(&model, &graph, operation)).collect();
         if self.json {
             let value = serde_json::json!({
                 "kind": "model",
                 "network": network,
                 "precision": model.options().precision.name(),
+                "kept_f32": kept,
                 "batch_norm_folded": rewrites.batch_norm,
                 "projection_folded": rewrites.projection,
                 "stored_numbers": parameters,
@@ -75,6 +80,17 @@ impl Inspect {
                 "output_bytes": memory.output,
                 "session_bytes": memory.total(),
                 "multiply_adds": multiply_adds,
+                "operations": operations.iter().enumerate().map(|(i, row)| serde_json::json!({
+                    "name": row.operation.name,
+                    "kind": row.operation.op.description().kind(),
+                    "per_camera": i < graph.camera_operations,
+                    "reads": row.reads(&graph),
+                    "writes": row.tensor.element.name(),
+                    "scale": row.tensor.scale.map(|scale| scale.step()),
+                    "output_bytes": row.tensor.bytes(),
+                    "weight_bytes": row.weight_bytes,
+                    "multiply_adds": graph.multiply_adds(row.operation),
+                })).collect::<Vec<_>>(),
             });
             println!("{value:#}");
             return Ok(());
@@ -89,6 +105,17 @@ impl Inspect {
             if rewrites.batch_norm { "folded" } else { "kept" },
             if rewrites.projection { "folded" } else { "kept" }
         );
+        if let Some(quantisation) = model.quantisation() {
+            let asked = match quantisation.keep_f32.is_empty() {
+                true => String::new(),
+                false => format!(", asked for: {}", quantisation.keep_f32.join(",")),
+            };
+            println!(
+                "int8       {} tensors with a scale; in f32: {} operations{asked}",
+                quantisation.scales.len(),
+                kept.len()
+            );
+        }
         println!("file       {}", terminal::bytes(model.file_size()));
         println!("images     {} x {} (height x width, padded)", network.image[0], network.image[1]);
         println!("output     {x} x {y} x {z} voxels, {} classes", network.classes);
@@ -102,15 +129,19 @@ impl Inspect {
         );
         println!("network    {}", network.to_json());
         if self.operations {
-            for (i, operation) in graph.operations.iter().enumerate() {
-                let tensor = graph.tensor(operation.result());
+            for (i, row) in operations.iter().enumerate() {
                 println!(
-                    "{:>4} {:60} {:?} x {:<5} {:>8.3} GMAC{}",
+                    "{:>4} {:60} {:18} {:>8} {:>3} {:?} x {:<5} {:>9} weights {:>9} {:>8.3} GMAC{}",
                     i,
-                    operation.name,
-                    tensor.extent,
-                    tensor.channels,
-                    graph.multiply_adds(operation) as f64 / 1e9,
+                    row.operation.name,
+                    row.operation.op.description().kind(),
+                    row.reads(&graph),
+                    row.tensor.element.name(),
+                    row.tensor.extent,
+                    row.tensor.channels,
+                    terminal::bytes(row.tensor.bytes()),
+                    terminal::bytes(row.weight_bytes),
+                    graph.multiply_adds(row.operation) as f64 / 1e9,
                     if i < graph.camera_operations { " per camera" } else { "" }
                 );
             }
@@ -166,4 +197,39 @@ impl Inspect {
         }
         Ok(())
     }
+}
+
+/// What is told of an operation.
+struct Row<'a> {
+    operation: &'a Operation,
+    /// What it writes; of a head the logits, if there are any.
+    tensor: &'a Tensor,
+    /// Of its stored parts.
+    weight_bytes: usize,
+}
+
+impl<'a> Row<'a> {
+    fn new(model: &Model, graph: &'a Graph, operation: &'a Operation) -> Self {
+        let precision = model.options().precision;
+        let parts = operation.op.description().parts(&graph.site(operation));
+        let weight_bytes = parts.iter().map(|part| part.stored_len(precision) * part.element(precision).bytes()).sum();
+        Self { operation, tensor: graph.tensor(operation.result()), weight_bytes }
+    }
+
+    /// Types of what it reads, each once.
+    fn reads(&self, graph: &Graph) -> String {
+        let mut names: Vec<&str> = self.operation.reads().map(|id| graph.tensor(id).element.name()).collect();
+        names.dedup();
+        names.join(" ")
+    }
+}
+
+/// Operations of an int8 model that compute in f32, conversions not counted.
+fn kept<'a>(model: &Model, graph: &'a Graph) -> Vec<&'a str> {
+    let in_f32 = |o: &&Operation| {
+        let [read, written] = [o.inputs[0], o.output()].map(|id| graph.tensor(id).element);
+        read == Element::F32 && written != Element::I8
+    };
+    let operations = graph.operations.iter().filter(in_f32).map(|operation| operation.name.as_str());
+    if model.quantisation().is_some() { operations.collect() } else { vec![] }
 }

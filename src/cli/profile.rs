@@ -6,9 +6,14 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use voxcast::graph::Graph;
+use voxcast::graph::{Element, Graph, Operation};
 use voxcast::session::{Event, views};
 use voxcast::{Budget, Error, ImageView, Isa, Result, Session, Step, Threads};
+use voxcast_kernels::conv::Geometry;
+use voxcast_kernels::conv_i8::{ConvI8, conv_i8};
+use voxcast_kernels::panels::packed_len;
+use voxcast_kernels::product::int8::{layout, scratch_len};
+use voxcast_kernels::product::{ProductI8, ResidualI8};
 
 /// Time every operation of a model on a scene: median, multiply-adds per second, the share of this machine's own peak,
 /// which is measured between the frames, and the longest slice when the frame is run in steps.
@@ -22,19 +27,23 @@ Examples:
 
 A step of a controller overruns its time by one slice at most. The column `slice` is the longest of each row, over as many
 frames as are timed, the line at the end the longest of all. On a shared machine, it holds what others did meanwhile.
-GMAC are billions of multiply-adds as the network has them; the share of the peak counts those that the kernels execute.
+GMAC are billions of multiply-adds as the network has them; the share of the peak counts those that the kernels execute. For
+models of int8 there are two peaks, of f32 and of bytes, and the share is the time that the work would take at them.
 
 Keys of --json:
   frame_seconds                  median time of a whole frame
   threads                        threads that computed
   peak_multiply_adds_per_second  of all threads, register to register, measured between the frames
+  integer_peak_multiply_adds_per_second
+                                 of bytes, in the first-level cache; null where none are multiplied
   multiply_adds                  of a frame, as the network has them
   executed_multiply_adds         of a frame, as the kernels execute them
+  integer_multiply_adds          those of them that are of bytes
   slices                         slices of a frame that is run in steps
   longest_slice_seconds          the longest of them
   longest_slice_operation        what it was a part of
   rows                           the table: of each name the median of its seconds in a frame, all cameras together, its
-                                 longest_slice_seconds, multiply_adds and executed_multiply_adds")]
+                                 longest_slice_seconds, multiply_adds, executed_multiply_adds and integer_multiply_adds")]
 pub struct Profile {
     /// The model
     #[arg(long)]
@@ -77,8 +86,8 @@ struct Row {
     slice: f64,
     /// As the network has them.
     multiply_adds: u64,
-    /// As the kernels execute them.
-    executed: u64,
+    /// As the kernels execute them, in f32 and of bytes.
+    executed: [u64; 2],
 }
 
 /// Frames in slices.
@@ -106,12 +115,17 @@ impl Profile {
             graph.operations.iter().enumerate().map(|(i, o)| (o.name.as_str(), i)).collect();
         let repeat = usize::from(self.repeat);
         let mut seconds = vec![vec![0.0f64; repeat + 1]; graph.operations.len()];
-        let mut peaks = vec![];
+        // Of multiply-adds in f32, and of bytes if there are any.
+        let integers = model.quantisation().is_some();
+        let mut peaks = [vec![], vec![]];
         let mut frames = vec![];
         let mut trace = vec![];
         let bar = terminal::progress("profiling", 2 * repeat + 1);
         for round in 0..=repeat {
-            peaks.push(peak(options.isa, &options.threads));
+            peaks[0].push(peak(options.isa, &options.threads, |isa| floats(isa, FLOAT_ROUNDS)));
+            if integers {
+                peaks[1].push(peak(options.isa, &options.threads, bytes));
+            }
             trace.clear();
             let start = Instant::now();
             session.run_observed(&images, &mut |event| {
@@ -131,12 +145,12 @@ impl Profile {
         if let Some(path) = &self.trace {
             write_trace(path, &graph, &trace)?;
         }
-        let peak = median(&mut peaks[1..]);
+        let peaks = peaks.map(|mut peaks| peaks.get_mut(1..).map(median));
         let frame = median(&mut frames[1..]);
         let rows = self.rows(&graph, &seconds, &sliced, images.len());
         let worst = (0..sliced.longest.len()).max_by(|&a, &b| sliced.longest[a].total_cmp(&sliced.longest[b]));
         let worst = worst.map_or("", |index| &graph.operations[index].name);
-        self.print(rows, frame, peak, options.threads.count(), sliced.slices, worst);
+        self.print(rows, frame, peaks, options.threads.count(), sliced.slices, worst);
         Ok(())
     }
 
@@ -151,12 +165,13 @@ impl Profile {
             };
             let times = if i < graph.camera_operations { cameras as u64 } else { 1 };
             let work = graph.multiply_adds(operation) * times;
-            let executed = graph.executed_multiply_adds(operation) * times;
+            let mut executed = [0; 2];
+            executed[usize::from(is_integer(graph, operation))] = graph.executed_multiply_adds(operation) * times;
             let slice = sliced.longest[i];
             match rows.iter_mut().find(|r| r.name == name) {
                 Some(row) => {
                     row.multiply_adds += work;
-                    row.executed += executed;
+                    row.executed.iter_mut().zip(executed).for_each(|(sum, work)| *sum += work);
                     row.slice = row.slice.max(slice);
                     row.seconds.iter_mut().zip(&seconds[i][1..]).for_each(|(sum, s)| *sum += s);
                 }
@@ -169,9 +184,9 @@ impl Profile {
         rows
     }
 
-    fn print(&self, rows: Vec<Row>, frame: f64, peak: f64, threads: usize, slices: usize, worst: &str) {
+    fn print(&self, rows: Vec<Row>, frame: f64, peaks: [Option<f64>; 2], threads: usize, slices: usize, worst: &str) {
         let total: u64 = rows.iter().map(|r| r.multiply_adds).sum();
-        let total_executed: u64 = rows.iter().map(|r| r.executed).sum();
+        let total_executed = [0, 1].map(|kind| rows.iter().map(|r| r.executed[kind]).sum::<u64>());
         let longest = rows.iter().map(|r| r.slice).fold(0.0, f64::max);
         let rows: Vec<_> = rows.into_iter().map(|mut r| (median(&mut r.seconds), r)).collect();
         if self.json {
@@ -180,13 +195,16 @@ impl Profile {
                 .map(|(seconds, row)| {
                     serde_json::json!({
                         "name": row.name, "seconds": seconds, "longest_slice_seconds": row.slice,
-                        "multiply_adds": row.multiply_adds, "executed_multiply_adds": row.executed,
+                        "multiply_adds": row.multiply_adds, "executed_multiply_adds": row.executed.iter().sum::<u64>(),
+                        "integer_multiply_adds": row.executed[1],
                     })
                 })
                 .collect();
             let value = serde_json::json!({
-                "frame_seconds": frame, "peak_multiply_adds_per_second": peak, "threads": threads,
-                "multiply_adds": total, "executed_multiply_adds": total_executed, "rows": rows, "slices": slices,
+                "frame_seconds": frame, "threads": threads,
+                "peak_multiply_adds_per_second": peaks[0], "integer_peak_multiply_adds_per_second": peaks[1],
+                "multiply_adds": total, "executed_multiply_adds": total_executed.iter().sum::<u64>(),
+                "integer_multiply_adds": total_executed[1], "rows": rows, "slices": slices,
                 "longest_slice_seconds": longest, "longest_slice_operation": worst,
             });
             println!("{value:#}");
@@ -202,7 +220,7 @@ impl Profile {
                 (String::new(), String::new(), String::new())
             } else {
                 let gmac = format!("{:.3}", *work as f64 / 1e9);
-                let share = *executed as f64 / s / peak;
+                let share = at_peak(executed, &peaks) / s;
                 (gmac, format!("{:.1}", rate / 1e9), format!("{:.0} %", 100.0 * share))
             };
             println!(
@@ -213,12 +231,17 @@ impl Profile {
             );
         }
         println!(
-            "frame {} on {threads} threads, {:.1} GMAC, {:.1} GMAC/s, {:.0} % of the measured peak of {:.1} GMAC/s",
+            "frame {} on {threads} threads, {:.1} GMAC, {:.1} GMAC/s, {:.0} % of the measured peak of {}",
             terminal::time(Duration::from_secs_f64(frame)),
             total as f64 / 1e9,
             total as f64 / frame / 1e9,
-            100.0 * total_executed as f64 / frame / peak,
-            peak / 1e9
+            100.0 * at_peak(&total_executed, &peaks) / frame,
+            match peaks {
+                [Some(floats), Some(bytes)] => {
+                    format!("{:.1} GMAC/s in f32 and {:.1} GMAC/s of bytes", floats / 1e9, bytes / 1e9)
+                }
+                [peak, _] => format!("{:.1} GMAC/s", peak.unwrap_or_default() / 1e9),
+            }
         );
         println!(
             "in steps: {slices} slices of about {} million multiply-adds, the longest {} in {worst}",
@@ -251,12 +274,72 @@ impl Sliced {
     }
 }
 
-/// Multiply-adds per second of all threads together, register to register.
-fn peak(isa: Isa, threads: &Threads) -> f64 {
-    let rounds = if isa == Isa::Scalar { 200_000 } else { 4_000_000 };
+/// Whether an operation multiplies bytes.
+fn is_integer(graph: &Graph, operation: &Operation) -> bool {
+    graph.tensor(operation.inputs[0]).element == Element::I8
+}
+
+/// Seconds that so many multiply-adds in f32 and of bytes take at this machine's peaks.
+fn at_peak(executed: &[u64; 2], peaks: &[Option<f64>; 2]) -> f64 {
+    executed.iter().zip(peaks).filter_map(|(&work, peak)| Some(work as f64 / (*peak)?)).sum()
+}
+
+/// Multiply-adds per second of all threads together, each of which does `work` and says how many they were.
+fn peak(isa: Isa, threads: &Threads, work: impl Fn(Isa) -> u64 + Sync) -> f64 {
     let start = Instant::now();
-    let work: u64 = threads.broadcast(|| voxcast_kernels::peak::multiply_adds(isa, rounds).0).into_iter().sum();
+    let work: u64 = threads.broadcast(|| work(isa)).into_iter().sum();
     work as f64 / start.elapsed().as_secs_f64()
+}
+
+/// Rounds of [`floats`] on vectors.
+const FLOAT_ROUNDS: usize = 4_000_000;
+
+/// Fused multiply-adds that never leave the registers.
+fn floats(isa: Isa, rounds: usize) -> u64 {
+    let rounds = if isa == Isa::Scalar { rounds / 20 } else { rounds };
+    voxcast_kernels::peak::multiply_adds(isa, rounds).0
+}
+
+/// Products of bytes that never leave the first-level cache.
+fn bytes(isa: Isa) -> u64 {
+    const SIDE: usize = 96;
+    const DEPTH: usize = 128;
+    const COLUMNS: usize = 32;
+    let repeat = if isa == Isa::Scalar { 20 } else { 2000 };
+    let mut weights = vec![0; packed_len(DEPTH, COLUMNS)];
+    layout::pack(DEPTH, COLUMNS, |k, n| ((k * 7 + n * 3) % 100) as i8 - 50, &mut weights);
+    let sums: Vec<i32> = layout::sums(&weights, DEPTH).collect();
+    let pairs: Vec<u8> = layout::pairs(&weights, DEPTH).collect();
+    let (input, ends) = (vec![3; SIDE * DEPTH], vec![1 << 20; COLUMNS]);
+    let one = [1; 3];
+    let extent = [1, 1, SIDE];
+    let geometry = Geometry {
+        input: extent,
+        channels: DEPTH,
+        kernel: one,
+        stride: one,
+        dilation: one,
+        padding: [0; 3],
+        output: extent,
+    };
+    let product = ProductI8 {
+        weights: &weights,
+        sums: &sums,
+        pairs: &pairs,
+        bias: &ends,
+        depth: DEPTH,
+        columns: COLUMNS,
+        signed: false,
+        relu: true,
+        residual: ResidualI8::None,
+        multiplier: &ends,
+    };
+    let args = ConvI8 { geometry, input: &input, product };
+    let (mut out, mut scratch) = (vec![0; SIDE * COLUMNS], vec![0; scratch_len(DEPTH, COLUMNS)]);
+    for _ in 0..repeat {
+        conv_i8(isa, std::hint::black_box(&args), 0..SIDE, COLUMNS, &mut out, &mut scratch);
+    }
+    (repeat * SIDE * DEPTH * COLUMNS) as u64
 }
 
 fn median(values: &mut [f64]) -> f64 {

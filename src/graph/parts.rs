@@ -95,7 +95,7 @@ impl Part {
 }
 
 /// No operation has more parts.
-pub const MAX_PARTS: usize = 16;
+pub const MAX_PARTS: usize = 15;
 
 #[cfg(test)]
 mod tests {

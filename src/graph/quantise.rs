@@ -7,8 +7,8 @@ use super::element::Element;
 use super::hidden::hidden_layers;
 use super::operation::{Graph, Operation};
 use super::ops::{
-    BroadcastI8, ConvI8, DepthwiseI8, Dequantise, GateI8, GatherI8, GlobalMeanI8, MaxPoolI8, NormaliseI8, Op, Quantise,
-    UpsampleAddI8,
+    BroadcastI8, ConvI8, DeconvI8, DeformConvI8, DepthwiseI8, Dequantise, GateI8, GatherI8, GlobalMeanI8, HeadI8,
+    MaxPoolI8, NormaliseI8, Op, Quantise, UpsampleAddI8,
 };
 use super::recipe::Recipe;
 use super::scale::Scale;
@@ -110,8 +110,7 @@ impl Graph {
             let odd = product(&operation.op)
                 && !on_image(operation)
                 && !self.tensor(operation.inputs[0]).channels.is_multiple_of(CHANNEL_GROUP);
-            let attention =
-                matches!(operation.op, Op::WindowAttention(_) | Op::Deconv(_) | Op::Head(_) | Op::DeformConv(_));
+            let attention = matches!(operation.op, Op::WindowAttention(_));
             kept.push(attention || odd || names.iter().any(|name| named(operation, name)));
         }
         let writers = self.writers();
@@ -244,15 +243,21 @@ impl Graph {
                 let geometry = Geometry { channels: inputs.next_multiple_of(CHANNEL_GROUP), ..conv.geometry };
                 ConvI8 { geometry, signed, inputs }.into()
             }
+            Op::DeformConv(conv) => DeformConvI8 { geometry: conv.geometry, signed }.into(),
             Op::Depthwise(depthwise) => DepthwiseI8 { side: depthwise.side }.into(),
             Op::MaxPool(pool) => MaxPoolI8 { side: pool.side, stride: pool.stride, padding: pool.padding }.into(),
             Op::UpsampleAdd(_) => UpsampleAddI8.into(),
             Op::Gather(gather) => {
                 GatherI8 { level: gather.level, matrix: gather.matrix, first_channel: gather.first_channel }.into()
             }
+            Op::Deconv(_) => DeconvI8 { signed }.into(),
             Op::Gate(_) => GateI8.into(),
             Op::GlobalMean(_) => GlobalMeanI8.into(),
             Op::Broadcast(_) => BroadcastI8.into(),
+            Op::Head(head) => {
+                let [first, second] = hidden_layers(&operation.name);
+                HeadI8 { classes: head.classes, signed, hidden: [scale(&first)?, scale(&second)?] }.into()
+            }
             other => unreachable!("{other:?} stays in floating point"),
         })
     }
@@ -325,3 +330,6 @@ impl Graph {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,10 +1,12 @@
 //! Sound containers that are no sound models.
 
 use super::*;
+use crate::ErrorKind;
 use crate::file::container;
-use crate::graph::Recipe;
 use crate::graph::parts::MAX_PARTS;
+use crate::graph::{Recipe, Scale};
 use crate::model::import::import;
+use crate::model::ranges::Ranges;
 use crate::model::seeded::SeededWeights;
 use crate::small;
 use std::sync::OnceLock;
@@ -25,7 +27,11 @@ type Loose = (String, Dtype, usize, Vec<u8>);
 
 /// The model's bytes after its tensors and metadata were edited, with a right checksum.
 fn edited(edit: impl FnOnce(&mut Vec<Loose>, &mut BTreeMap<String, String>)) -> Vec<u8> {
-    let model = Container::from_bytes(sound(Options::default())).expect("sound");
+    edited_of(sound(Options::default()), edit)
+}
+
+fn edited_of(model: Vec<u8>, edit: impl FnOnce(&mut Vec<Loose>, &mut BTreeMap<String, String>)) -> Vec<u8> {
+    let model = Container::from_bytes(model).expect("sound");
     let loose = |name: String| {
         let (dtype, shape, bytes) = model.tensor(&name).expect("a listed name");
         (name, dtype, shape[0], bytes.to_vec())
@@ -89,13 +95,13 @@ fn models_say_what_they_are() {
             assert_eq!((model.options(), model.file_size(), model.path()), (options, size, None));
             assert_eq!(*model.network(), network());
             assert!(model.checksum().is_some());
-            let stored: Vec<String> = model.tensors().map(|(name, ..)| name).collect();
+            let found: Vec<String> = model.tensors().map(|(name, ..)| name).collect();
             let graphs = model.form.graphs().expect("sound");
             let expected = stored(&graphs).into_iter().flat_map(|(g, o)| {
                 let operation = &graphs[g].operations[o];
                 parts(&graphs[g], operation).into_iter().map(|part| format!("{}.{}", operation.name, part.suffix))
             });
-            assert!(stored.into_iter().eq(expected), "in this order");
+            assert!(found.into_iter().eq(expected), "in this order");
             for unfolded in [false, true] {
                 let graph = model.graph(unfolded, Results::ALL);
                 for operation in &graph.operations {
@@ -160,17 +166,153 @@ fn tensors_that_are_wrong_are_named() {
 fn no_operation_has_more_parts_than_a_session_has_room_for() {
     for name in crate::network::BUILT_IN {
         let network = Network::built_in(name).expect("built in");
+        let most = |graph: &Graph| {
+            assert!(graph.operations.iter().flat_map(|o| parts(graph, o)).all(|part| part.len > 0));
+            graph.operations.iter().map(|o| parts(graph, o).len()).max().expect("operations")
+        };
         for rewrites in [Rewrites::ALL, Rewrites::NONE] {
             let graph = Graph::build(&network, Results::ALL).rewritten(rewrites);
-            let counts: Vec<usize> = graph.operations.iter().map(|o| parts(&graph, o).len()).collect();
-            assert_eq!(counts.iter().max(), Some(&MAX_PARTS));
+            assert_eq!(most(&graph), 7);
             for operation in &graph.operations {
-                let parts = parts(&graph, operation);
-                assert_eq!(parts.is_empty(), operation.recipe == Recipe::None, "{}", operation.name);
-                assert!(parts.iter().all(|p| p.len > 0), "{}", operation.name);
+                let stores = !parts(&graph, operation).is_empty();
+                assert_eq!(stores, operation.recipe != Recipe::None, "{}", operation.name);
+            }
+        }
+        let graph = Graph::build(&network, Results::ALL).rewritten(Rewrites::ALL);
+        let graph = graph.quantise(&[], &mut |_| Scale::of_range(1.0)).expect("scales for all");
+        assert_eq!(most(&graph), MAX_PARTS);
+    }
+}
+
+/// A network and an int8 model of it.
+fn int8() -> (Network, Vec<u8>) {
+    let network = small::suited(network(), Precision::I8);
+    let bytes = small::model_bytes(&network, Precision::I8, Rewrites::ALL, 1);
+    (network, bytes)
+}
+
+#[test]
+fn int8_models_say_what_they_are() {
+    let (network, bytes) = int8();
+    assert_eq!(bytes, int8().1, "the same each time");
+    let model = Model::from_bytes(bytes).expect("sound");
+    assert_eq!((model.options().precision, model.network()), (Precision::I8, &network));
+    let quantisation = model.quantisation().expect("int8");
+    assert_eq!(quantisation.keep_f32, [""; 0]);
+    let graph = model.graph(false, Results::ALL);
+    assert_eq!(graph, model.graph(true, Results::ALL), "there is no other");
+    let scaled = graph.tensors.iter().filter(|tensor| tensor.scale.is_some()).count();
+    assert!(scaled > 60 && quantisation.scales.len() > 60, "{scaled}");
+    assert!(small::model(&network, Precision::F32, Rewrites::ALL, 1).quantisation().is_none());
+}
+
+#[test]
+fn what_kernels_take_for_granted_of_int8_is_checked() {
+    let (_, bytes) = int8();
+    let refused = |part: &str, change: &dyn Fn(&mut [u8]), expected: &str| {
+        let edited = edited_of(bytes.clone(), |tensors, _| {
+            let (.., data) = tensors.iter_mut().find(|(name, ..)| name == part).expect(part);
+            change(data);
+        });
+        let error = Model::from_bytes(edited).expect_err(expected);
+        assert_eq!(error.kind(), ErrorKind::Format, "{error}");
+        assert!(error.message().contains(expected) && !error.message().contains('\n'), "{error} (expected {expected})");
+    };
+    let put = |value: i32| move |data: &mut [u8]| data[..4].copy_from_slice(&value.to_le_bytes());
+    let conv = "img_backbone.layer1.0.conv1";
+    let of = |part: &str| format!("{conv}.{part}");
+    refused(&of("weight"), &|data| data[5] = 0x80, "conv1\": weight [5] is -128, expected -127 to 127");
+    refused(&of("weight"), &|data| data[0] = data[0].wrapping_add(1) & 0x7f, "sums [0]: found");
+    refused(&of("sums"), &|data| data[0] ^= 1, "sums [0]: found");
+    refused(&of("pairs"), &|data| data[0] ^= 1, "pairs [0]: found");
+    refused(&of("bias"), &put(i32::MAX), "column 0: its sum may reach");
+    refused(&of("multiplier"), &put(-1), "multiplier: found -1, expected 0 to 2147483647");
+    refused("img_backbone.layer1.0.conv3.residual", &put(1 << 30), "column 0: its sum may reach");
+    refused("image.factors", &put(-1), "\"image\": factor: found -1");
+    refused("image.offsets", &put(i32::MIN), "offset: found");
+    refused("img_neck.sum.0.factors", &put(1 << 15), "factor: found 32768, expected 0 to 32767");
+    let level = "view_transformer.imvts.0";
+    refused(&format!("{level}.gather.volume.factor"), &put(i32::MAX), "factor: found");
+    refused(&format!("{level}.gather.volume.bias"), &put(i32::MIN), "bias: found");
+    refused(&format!("{level}.combine_coeff.weight"), &|data| data[1] = 0x80, "weight [1] is -128");
+    refused(&format!("{level}.combine_coeff.logit"), &put(i32::MAX), "the logit's sum may reach");
+    refused(&format!("{level}.combine_coeff.factors"), &put(-5), "factor: found -5");
+    refused(&format!("{level}.bev_attn_layer.dw0.m.c.weight"), &|data| data[0] = 0x80, "weight [0] is -128");
+    refused(&format!("{level}.bev_attn_layer.dw0.m.c.bias"), &put(i32::MIN), "channel 0: its sum may reach");
+    refused(&format!("{level}.aspp_xy.aspp.convs.5.0.factor"), &put(-1), "factor: found -1");
+    refused("view_transformer.up_sample1.0.sums", &|data| data[0] ^= 1, "sums [0]: found");
+    refused("occ_head.mlp_occ_lvl0.1.weight", &|data| data[0] = 0x80, "layer 1: weight [0] is -128");
+    refused("occ_head.mlp_occ_lvl0.2.scale", &put(0), "2.scale is 0e0, expected");
+    let metadata = |key: &'static str, value: &'static str, expected: &str| {
+        let edited = edited_of(bytes.clone(), |_, m| drop(m.insert(key.to_owned(), value.to_owned())));
+        let error = Model::from_bytes(edited).expect_err(expected);
+        assert_eq!(error.kind(), ErrorKind::Format);
+        assert!(error.message().contains(expected), "{error} (expected {expected})");
+    };
+    metadata("scales", "{}", "tensor \"image\": its scale is missing");
+    metadata("scales", "{\"image\":0}", "metadata key \"scales\"");
+    metadata("scales", "[]", "metadata key \"scales\"");
+    metadata("keep_f32", "[\"nothing\"]", "no operation \"nothing\"");
+    metadata("keep_f32", "[\"img_backbone.layer1.0.conv1\"]", "is missing");
+    metadata("precision", "f32", "is missing");
+}
+
+#[test]
+fn int8_is_refused_where_it_cannot_be() {
+    let (network, _) = int8();
+    let options = Options { precision: Precision::I8, rewrites: Rewrites::ALL };
+    let source = SeededWeights { seed: 1 };
+    let error = import::import_to_bytes(&source, &network, options, &mut |_, _| ()).expect_err("no ranges");
+    assert!(error.message().contains("int8 needs the ranges"), "{error}");
+    let refused = |change: &dyn Fn(&mut Ranges), expected: &str| {
+        let mut ranges = small::ranges(&network, Rewrites::ALL, 1);
+        change(&mut ranges);
+        let integers = import::Integers { rewrites: Rewrites::ALL, ranges: &ranges, keep_f32: &[] };
+        let error = import::import_int8_to_bytes(&small::Weights(1), &network, &integers, &mut |_, _| ());
+        let error = error.expect_err(expected);
+        assert!(error.message().contains(expected) && !error.message().contains('\n'), "{error} (expected {expected})");
+    };
+    let conv = "img_backbone.layer1.0.conv1";
+    refused(
+        &|ranges| assert!(ranges.tensors.remove(conv).is_some()),
+        "\"img_backbone.layer1.0.conv1\": the ranges lack it",
+    );
+    let set =
+        |threshold: f64| move |ranges: &mut Ranges| ranges.tensors.get_mut(conv).expect("it").threshold = threshold;
+    refused(&set(0.0), "its range is 0");
+    refused(&set(f64::NAN), "range NaN");
+    refused(&set(1e-43), "the scale underflows");
+    refused(&set(1e-12), "operation \"img_backbone.layer1.0.conv1\": the output's step of");
+    let integers = import::Integers {
+        rewrites: Rewrites::NONE,
+        ranges: &small::ranges(&network, Rewrites::ALL, 1),
+        keep_f32: &[],
+    };
+    let error = import::import_int8_to_bytes(&source, &network, &integers, &mut |_, _| ()).expect_err("batch norms");
+    assert!(error.message().contains("folded batch norms"), "{error}");
+}
+
+#[test]
+fn a_model_gives_its_weights_back() {
+    let network = network();
+    for (precision, rewrites) in
+        [(Precision::F32, Rewrites::ALL), (Precision::F16, Rewrites { projection: false, ..Rewrites::ALL })]
+    {
+        let model = small::model(&network, precision, rewrites, 1);
+        let source = unpacked::Unpacked::new(&model).expect("floating point");
+        let again = import::import_to_bytes(&source, &network, model.options(), &mut |_, _| ()).expect("all weights");
+        let again = Model::from_bytes(again).expect("a model");
+        for ((name, _, _, found), (expected_name, _, _, expected)) in again.contents().zip(model.contents()) {
+            assert_eq!(name, expected_name);
+            // Folded products of folded weights are rounded twice.
+            if !name.contains(".projected.") {
+                assert!(found == expected, "{name}");
             }
         }
     }
+    let kept = small::model(&network, Precision::F32, Rewrites::NONE, 1);
+    assert!(unpacked::Unpacked::new(&kept).is_err());
+    assert!(unpacked::Unpacked::new(&Model::from_bytes(int8().1).expect("a model")).is_err());
 }
 
 #[test]

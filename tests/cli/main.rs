@@ -12,6 +12,7 @@ mod small;
 mod damaged;
 mod drives;
 mod evaluation;
+mod int8;
 mod logs;
 mod outside;
 mod results;
@@ -110,16 +111,20 @@ struct Place(tempfile::TempDir);
 
 impl Place {
     fn new() -> Self {
+        Self::of(&network())
+    }
+
+    fn of(network: &Network) -> Self {
         let place = Self(tempfile::tempdir().unwrap());
-        fs::write(place.path("network.json"), network().to_json()).unwrap();
+        fs::write(place.path("network.json"), network.to_json()).unwrap();
         let recorder = Recorder(RefCell::default());
         let options = Options { rewrites: Rewrites::NONE, ..Options::default() };
-        import(&recorder, &network(), options, &place.path("recorded"), &mut |_, _| ()).unwrap();
+        import(&recorder, network, options, &place.path("recorded"), &mut |_, _| ()).unwrap();
         fs::remove_file(place.path("recorded")).unwrap();
         let tensors = recorder.0.into_inner();
         fs::write(place.path("weights.pth"), pth_bytes(&tensors)).unwrap();
         fs::write(place.path("weights.safetensors"), plain_bytes(&tensors)).unwrap();
-        small::scene(&network(), 1).save(&place.path("scene")).unwrap();
+        small::scene(network, 1).save(&place.path("scene")).unwrap();
         place
     }
 

@@ -1,14 +1,16 @@
 //! Small networks with drawn weights, rigs and images: whole sessions in milliseconds.
 
 use std::sync::Arc;
+use voxcast::calibrate::Calibrator;
 use voxcast::graph::Rewrites;
-use voxcast::import::{Source, import};
+use voxcast::import::{Integers, Source, import, import_int8_to_bytes};
 use voxcast::model::Options;
+use voxcast::model::ranges::Ranges;
 use voxcast::network::{Block, Sampling};
 use voxcast::random::Random;
 use voxcast::rig::RigBuilder;
 use voxcast::weights::Precision;
-use voxcast::{ImageView, Isa, Model, Network, Rig};
+use voxcast::{ImageView, Isa, Model, Network, Rig, Threads};
 
 #[path = "scene.rs"]
 mod scene;
@@ -55,9 +57,37 @@ pub(crate) fn tiny() -> Network {
     }
 }
 
-/// A model file in memory.
+/// The network with channels that models of this precision compute as it says: for int8 in multiples of four.
+pub(crate) fn suited(network: Network, precision: Precision) -> Network {
+    match precision {
+        Precision::F32 | Precision::F16 => network,
+        Precision::I8 => Network { width: 4, fpn: 20, channels: [12, 16, 24, 32], key_dims: [2, 3, 4], ..network },
+    }
+}
+
+/// A model file in memory; of int8 with ranges measured on two drawn scenes.
 pub(crate) fn model_bytes(network: &Network, precision: Precision, rewrites: Rewrites, seed: u64) -> Vec<u8> {
-    bytes_of(&Weights(seed), network, Options { precision, rewrites })
+    match precision {
+        Precision::F32 | Precision::F16 => bytes_of(&Weights(seed), network, Options { precision, rewrites }),
+        Precision::I8 => int8_bytes(network, rewrites, seed, &[]),
+    }
+}
+
+/// An int8 model file in memory, with these operations kept in f32.
+pub(crate) fn int8_bytes(network: &Network, rewrites: Rewrites, seed: u64, keep_f32: &[String]) -> Vec<u8> {
+    let ranges = ranges(network, rewrites, seed);
+    let integers = Integers { rewrites, ranges: &ranges, keep_f32 };
+    import_int8_to_bytes(&Weights(seed), network, &integers, &mut |_, _| ()).unwrap()
+}
+
+/// Ranges of the network's tensors on two drawn scenes.
+pub(crate) fn ranges(network: &Network, rewrites: Rewrites, seed: u64) -> Ranges {
+    let model = model(network, Precision::F32, rewrites, seed);
+    let mut calibrator = Calibrator::new(model, Isa::best(), &Threads::calling()).unwrap();
+    for seed in [3, 4] {
+        calibrator.see(&scene(network, seed)).unwrap();
+    }
+    calibrator.ranges().unwrap()
 }
 
 pub(crate) fn model(network: &Network, precision: Precision, rewrites: Rewrites, seed: u64) -> Arc<Model> {

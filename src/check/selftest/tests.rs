@@ -1,16 +1,13 @@
 use super::*;
 use crate::graph::Rewrites;
 use crate::graph::parts::Precision;
-use crate::model::Options;
-use crate::model::import::import;
-use crate::model::seeded::SeededWeights;
 use crate::small;
 
 fn recorded(precision: Precision) -> (tempfile::TempDir, std::path::PathBuf) {
     let directory = tempfile::tempdir().expect("a directory");
     let path = directory.path().join("model");
-    let options = Options { precision, rewrites: Rewrites::ALL };
-    import(&SeededWeights { seed: 1 }, &small::tiny(), options, &path, &mut |_, _| ()).expect("a model");
+    let network = small::suited(small::tiny(), precision);
+    std::fs::write(&path, small::model_bytes(&network, precision, Rewrites::ALL, 1)).expect("a model");
     record(&path, Isa::best(), &Threads::calling()).expect("a self-test");
     (directory, path)
 }
@@ -40,7 +37,7 @@ fn rewrite(path: &Path, edit: impl Fn(&mut SelfTest), tensor: &str, change: impl
 
 #[test]
 fn a_sound_machine_passes_on_every_instruction_set_and_number_of_threads() {
-    for precision in [Precision::F32, Precision::F16] {
+    for precision in Precision::ALL {
         let (_directory, path) = recorded(precision);
         let model = open(&path);
         for isa in Isa::available() {
@@ -94,7 +91,7 @@ fn wrong_digests_and_other_operations_are_found() {
 fn a_model_without_or_with_a_malformed_one_says_so() {
     let (directory, path) = recorded(Precision::F32);
     let plain = directory.path().join("plain");
-    import(&SeededWeights { seed: 1 }, &small::tiny(), Options::default(), &plain, &mut |_, _| ()).expect("a model");
+    std::fs::write(&plain, small::model_bytes(&small::tiny(), Precision::F32, Rewrites::ALL, 1)).expect("a model");
     let error = run(&open(&plain), Isa::best(), &Threads::calling()).expect_err("none");
     assert_eq!(error.kind(), ErrorKind::Unsupported);
     let model = open(&path);

@@ -15,11 +15,32 @@ use voxcast_kernels::panels::packed_len;
 /// Taps per axis of the kernel.
 const SIDE: usize = 4;
 /// Taps that an output of one parity meets, of two per axis; there are as many parities.
-const TAPS: usize = 8;
+pub(super) const TAPS: usize = 8;
 
 /// [`voxcast_kernels::deconv3d`]: x. A residual is added after the ReLU.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Deconv;
+
+/// Element (k, n) of the matrix of a parity, k running over (tap, input), by parity, k and n; and the bias.
+pub(super) fn folded(
+    site: &Site<'_>,
+    weights: &Weights<'_>,
+) -> Result<(impl Fn(usize, usize, usize) -> f64 + use<>, Values)> {
+    let Recipe::Conv(names) = site.recipe else { unreachable!("one convolution, not {:?}", site.recipe) };
+    let (inputs, outputs) = (site.input(0).channels, site.channels);
+    let raw = weights.tensor(&format!("{}.weight", names.prefix), &[inputs, outputs, SIDE, SIDE, SIDE])?;
+    let mut bias = weights.tensor(&format!("{}.bias", names.prefix), &[outputs])?;
+    let scale = weights.fold(names, &mut bias)?;
+    let weight = move |parity: usize, k: usize, n: usize| {
+        let (tap, c) = (k / inputs, k % inputs);
+        let at = (0..3).fold(c * outputs + n, |at, axis| {
+            let bit = 2 - axis;
+            at * SIDE + kernel_tap(parity >> bit & 1, tap >> bit & 1)
+        });
+        raw[at] * scale[n]
+    };
+    Ok((weight, bias))
+}
 
 impl Description for Deconv {
     fn kind(&self) -> &'static str {
@@ -33,21 +54,9 @@ impl Description for Deconv {
     }
 
     fn evaluate(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
-        let Recipe::Conv(names) = site.recipe else { unreachable!("one convolution, not {:?}", site.recipe) };
         let (inputs, outputs) = (site.input(0).channels, site.channels);
-        let raw = weights.tensor(&format!("{}.weight", names.prefix), &[inputs, outputs, SIDE, SIDE, SIDE])?;
-        let mut bias = weights.tensor(&format!("{}.bias", names.prefix), &[outputs])?;
-        let scale = weights.fold(names, &mut bias)?;
-        let weight = (0..TAPS).flat_map(|parity| {
-            packed_by(TAPS * inputs, outputs, |k, n| {
-                let (tap, c) = (k / inputs, k % inputs);
-                let at = (0..3).fold(c * outputs + n, |at, axis| {
-                    let bit = 2 - axis;
-                    at * SIDE + kernel_tap(parity >> bit & 1, tap >> bit & 1)
-                });
-                raw[at] * scale[n]
-            })
-        });
+        let (folded, bias) = folded(site, weights)?;
+        let weight = (0..TAPS).flat_map(|parity| packed_by(TAPS * inputs, outputs, |k, n| folded(parity, k, n)));
         Ok(vec![weight.collect(), padded(bias)])
     }
 

@@ -6,13 +6,13 @@ use crate::graph::call::{Call, Tile};
 use crate::graph::parts::Part;
 use crate::graph::recipe::{ConvNames, Recipe};
 use crate::graph::site::Site;
-use crate::graph::weights::{Values, Weights, packed, padded};
+use crate::graph::weights::{Dense, Values, Weights, packed, padded};
 use voxcast_kernels::LANES;
 use voxcast_kernels::head::{Head as Kernel, head, scratch_len};
 use voxcast_kernels::panels::packed_len;
 
 /// Voxels that one worker classifies at a time.
-const VOXELS: usize = 960;
+pub(super) const VOXELS: usize = 960;
 
 /// [`voxcast_kernels::head`]: x. Writes a class per voxel, and logits where the graph has a tensor for them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -27,6 +27,18 @@ impl Head {
         let channels = site.input(0).channels;
         [channels, channels, self.classes]
     }
+}
+
+/// The three layers of a head, which have so many columns.
+pub(super) fn layers(site: &Site<'_>, columns: [usize; 3], weights: &Weights<'_>) -> Result<Vec<Dense>> {
+    let Recipe::Module(prefix) = site.recipe else { unreachable!("a head, not {:?}", site.recipe) };
+    let channels = site.input(0).channels;
+    // ReLUs stand between the layers.
+    let layers = [0, 2, 4].into_iter().zip(columns).map(|(layer, columns)| {
+        let names = ConvNames { prefix: format!("{prefix}.{layer}"), bias: true, norm: None };
+        weights.dense(&names, &[columns, channels], columns)
+    });
+    layers.collect()
 }
 
 impl Description for Head {
@@ -47,14 +59,9 @@ impl Description for Head {
     }
 
     fn evaluate(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
-        let Recipe::Module(prefix) = site.recipe else { unreachable!("a head, not {:?}", site.recipe) };
-        let channels = site.input(0).channels;
         let mut values = vec![];
-        // ReLUs stand between the layers.
-        for (layer, columns) in [0, 2, 4].into_iter().zip(self.columns(site)) {
-            let names = ConvNames { prefix: format!("{prefix}.{layer}"), bias: true, norm: None };
-            let dense = weights.dense(&names, &[columns, channels], columns)?;
-            values.extend([packed(&dense.weight, channels, columns), padded(dense.bias)]);
+        for (dense, columns) in layers(site, self.columns(site), weights)?.into_iter().zip(self.columns(site)) {
+            values.extend([packed(&dense.weight, site.input(0).channels, columns), padded(dense.bias)]);
         }
         Ok(values)
     }

@@ -46,7 +46,7 @@ impl Steps {
     /// [`ErrorKind::Unsupported`] if the output's step, or the residual's, is too fine for the weights.
     pub(super) fn column(&self, weights: &[f64], bias: f64) -> Result<Column> {
         let most = weights.iter().fold(0.0f64, |most, w| most.max(w.abs()));
-        let power = f64::from(MULTIPLIER_BITS).exp2();
+        let power = super::power(MULTIPLIER_BITS);
         let mut scale = (most / LEVELS)
             .max(bias.abs() / (self.input * MOST_BIAS))
             .max(LEAST_MULTIPLIER / power * self.output / self.input);
@@ -74,6 +74,35 @@ impl Steps {
             self.input
         );
         Error::new(ErrorKind::Unsupported, message)
+    }
+}
+
+/// Columns of one scale, whose sums are not brought to an output's.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Common {
+    input: f64,
+    scale: f64,
+}
+
+impl Steps {
+    /// The finest scale for weights up to `most`, and these biases.
+    pub(super) fn common(input: f64, most: f64, bias: &[f64]) -> Common {
+        let bias = bias.iter().fold(0.0f64, |most, bias| most.max(bias.abs()));
+        let scale = (most / LEVELS).max(bias / (input * MOST_BIAS));
+        Common { input, scale: if scale > 0.0 { scale } else { 1.0 } }
+    }
+}
+
+impl Common {
+    /// What one step of the sums is.
+    pub(super) fn unit(self) -> f64 {
+        self.input * self.scale
+    }
+
+    /// The column of these weights.
+    pub(super) fn column(self, weights: &[f64], bias: f64) -> Column {
+        let weights = weights.iter().map(|w| (w / self.scale).round().clamp(-LEVELS, LEVELS)).collect();
+        Column { weights, bias: (bias / self.unit()).round(), residual: 0.0, multiplier: 0.0 }
     }
 }
 

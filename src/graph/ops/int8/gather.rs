@@ -1,6 +1,6 @@
 //! The sparse mean of 8-bit features.
 
-use super::{factor, integers, step, within};
+use super::{factor, integers, power, step, within};
 use crate::base::error::Result;
 use crate::graph::call::{Call, Tile};
 use crate::graph::element::Elements;
@@ -51,7 +51,7 @@ impl Description for GatherI8 {
         let mut values = vec![vec![factor(site.input(0), site.output(), FRACTION)]];
         if let Recipe::Bias { names, inputs } = site.recipe {
             let dense = pointwise(weights, names, site.output().space, site.channels, *inputs)?;
-            let (unit, most) = (f64::from(FRACTION).exp2() / step(site.output()), f64::from(MAX_BIAS));
+            let (unit, most) = (power(FRACTION) / step(site.output()), f64::from(MAX_BIAS));
             values.push(padded(dense.bias.iter().map(|bias| (bias * unit).round().clamp(-most, most)).collect()));
         }
         Ok(values)

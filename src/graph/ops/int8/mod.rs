@@ -8,10 +8,13 @@ mod broadcast;
 mod columns;
 mod conv;
 mod convert;
+mod deconv;
+mod deform_conv;
 mod depthwise;
 mod gate;
 mod gather;
 mod global_mean;
+mod head;
 mod max_pool;
 mod normalise;
 mod product;
@@ -20,10 +23,13 @@ mod upsample_add;
 pub use broadcast::BroadcastI8;
 pub use conv::ConvI8;
 pub use convert::{Dequantise, Quantise};
+pub use deconv::DeconvI8;
+pub use deform_conv::DeformConvI8;
 pub use depthwise::DepthwiseI8;
 pub use gate::GateI8;
 pub use gather::GatherI8;
 pub use global_mean::GlobalMeanI8;
+pub use head::HeadI8;
 pub use max_pool::MaxPoolI8;
 pub use normalise::NormaliseI8;
 pub use upsample_add::UpsampleAddI8;
@@ -42,7 +48,12 @@ fn step(tensor: &Tensor) -> f64 {
 
 /// `2^bits * step / of step`, rounded: a factor in fixed point from one tensor's scale to another's.
 fn factor(from: &Tensor, to: &Tensor, bits: u32) -> f64 {
-    (f64::from(bits).exp2() * (step(from) / step(to))).round()
+    (power(bits) * (step(from) / step(to))).round()
+}
+
+/// `2^bits`.
+fn power(bits: u32) -> f64 {
+    (1u64 << bits) as f64
 }
 
 /// One part of a few integers.

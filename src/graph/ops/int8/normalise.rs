@@ -1,6 +1,6 @@
 //! Camera bytes to an 8-bit image, normalised and padded.
 
-use super::{integers, step, within};
+use super::{integers, power, step, within};
 use crate::base::error::Result;
 use crate::graph::call::{Call, Tile};
 use crate::graph::element::Elements;
@@ -31,7 +31,7 @@ impl Description for NormaliseI8 {
     }
 
     fn evaluate(&self, site: &Site<'_>, _: &Weights<'_>) -> Result<Vec<Values>> {
-        let unit = f64::from(FRACTION).exp2() / step(site.output());
+        let unit = power(FRACTION) / step(site.output());
         let offsets = BGR_MEAN.map(|mean| (-unit * f64::from(mean)).round());
         Ok(vec![vec![unit.round(); 3], offsets.into()])
     }

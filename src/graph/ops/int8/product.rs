@@ -14,13 +14,15 @@ use voxcast_kernels::matmul::layout::packed_len;
 use voxcast_kernels::matmul::{ProductI8, ResidualI8};
 
 /// The order of a product's parts.
-const WEIGHTS: usize = 0;
-const SUMS: usize = 1;
-const PAIRS: usize = 2;
-const BIAS: usize = 3;
-const MULTIPLIER: usize = 4;
+pub(super) const WEIGHTS: usize = 0;
+pub(super) const SUMS: usize = 1;
+pub(super) const PAIRS: usize = 2;
+pub(super) const BIAS: usize = 3;
+pub(super) const MULTIPLIER: usize = 4;
+/// The residual's multipliers, where there is one.
+pub(super) const RESIDUAL: usize = 5;
 /// Parts of a product without residual.
-pub(super) const PARTS: usize = 5;
+pub(super) const PARTS: usize = RESIDUAL;
 
 /// Weights, what is known of them, bias and multipliers of products of `depth` x `columns`, `panels` of them with weights of
 /// their own; the residual's multipliers if it has one. The panels' weights, sums and pairs follow each other.
@@ -90,20 +92,29 @@ pub(super) fn columns(
 
 /// Checks what kernels take for granted of [`values`].
 pub(super) fn verify(depth: usize, columns: usize, parts: &[Elements<'_>]) -> std::result::Result<(), String> {
+    verify_multipliers(&parts[MULTIPLIER])?;
+    verify_weights(depth, columns, parts)
+}
+
+/// Checks multipliers.
+pub(super) fn verify_multipliers(part: &Elements<'_>) -> std::result::Result<(), String> {
+    super::within(part, "multiplier", 0..=i32::MAX)
+}
+
+/// Checks weights, what is declared of them, and that no sum can leave i32.
+pub(super) fn verify_weights(depth: usize, columns: usize, parts: &[Elements<'_>]) -> std::result::Result<(), String> {
     let len = packed_len(depth, columns);
     let weights: &[i8] = parts[WEIGHTS].of();
     if let Some(at) = weights.iter().position(|w| *w == i8::MIN) {
         return Err(format!("weight [{at}] is -128, expected -127 to 127"));
     }
-    let padded = columns.next_multiple_of(LANES);
     let sums = weights.chunks_exact(len).flat_map(|weights| layout::sums(weights, depth));
     check_equal("sums", sums, parts[SUMS].of())?;
     let pairs = weights.chunks_exact(len).flat_map(|weights| layout::pairs(weights, depth));
     check_equal("pairs", pairs, parts[PAIRS].of())?;
-    super::within(&parts[MULTIPLIER], "multiplier", 0..=i32::MAX)?;
-    let residual = parts.get(PARTS).map(|part| part.of::<i32>());
+    let residual = parts.get(RESIDUAL).map(|part| part.of::<i32>());
     for weights in weights.chunks_exact(len) {
-        layout::fits(weights, depth, columns, &parts[BIAS].of::<i32>()[..padded], residual).map_err(|overflow| {
+        layout::fits(weights, depth, columns, parts[BIAS].of(), residual).map_err(|overflow| {
             format!("column {}: its sum may reach {}, expected at most {}", overflow.column, overflow.bound, i32::MAX)
         })?;
     }
@@ -141,11 +152,11 @@ pub(super) fn product<'a>(call: &Call<'a>, depth: usize, signed: bool) -> Produc
 fn residual<'a>(call: &Call<'a>) -> ResidualI8<'a> {
     match call.added {
         Added::Nothing => ResidualI8::None,
-        Added::InPlace => ResidualI8::InPlace { multiplier: call.part(PARTS), after: false },
+        Added::InPlace => ResidualI8::InPlace { multiplier: call.part(RESIDUAL), after: false },
         Added::Apart { elements, after } => {
             // A residual has the shape of the output.
             let stride = call.site.output().channels;
-            ResidualI8::Apart { rows: elements.of(), stride, multiplier: call.part(PARTS), after }
+            ResidualI8::Apart { rows: elements.of(), stride, multiplier: call.part(RESIDUAL), after }
         }
     }
 }
