@@ -5,6 +5,7 @@
 pub mod cases;
 pub mod gpu;
 pub mod network;
+pub mod network_i8;
 pub mod operations;
 pub mod operations_i8;
 pub mod ops;

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use voxcast::graph::ops::{Gather, Shader};
 use voxcast::graph::{self, Graph, Lifetime, Op, Operation, Results, Scope, Space};
 use voxcast::import::Source;
+use voxcast::scene::Image;
 use voxcast::{Network, Scene};
 
 /// Side of an attention window, at most (EfficientViT, arXiv 2305.07027).
@@ -50,69 +51,152 @@ pub fn run(
     scene.check(network)?;
     let matrices = matrices.unwrap_or_else(|| projection::matrices(gpu, network, &scene.lidar2img));
     let graph = Graph::build(network, Results::ALL);
-    let mut walk = Run { gpu, graph: &graph, weights, matrices: &matrices, frame: BTreeMap::new(), stages: vec![] };
-    let mut features: Vec<BTreeMap<usize, Tensor>> = vec![];
+    let loader = Loader { gpu, weights };
+    let mut run = Run { gpu, graph: &graph, loader, matrices: &matrices, stages: Stages::default() };
+    walk(&graph, scene, &mut |operation, image, tensors, features| {
+        let Some(image) = image.filter(|_| matches!(operation.op, Op::Normalise(_))) else {
+            return run.operation(operation, tensors, features);
+        };
+        let image = ops::normalise(gpu, &image.bgr, [image.height, image.width], network.image);
+        run.stages.keep(&graph, operation, &image, Dtype::F32, floats(&gpu.read(&image.buffer)));
+        tensors.insert(operation.output().0, image);
+        Ok(())
+    })?;
+    Ok(run.stages.with(&matrices))
+}
+
+/// Tensors by number.
+pub(crate) type Tensors = BTreeMap<usize, Tensor>;
+
+/// What [`walk`] calls: with the operation, a camera's image in its pass, the pass's or the frame's tensors, and those that
+/// each camera's pass left.
+pub(crate) type Step<'a> = dyn FnMut(&Operation, Option<&Image>, &mut Tensors, &[Tensors]) -> Result<(), Failure> + 'a;
+
+/// Calls `step` for every operation, in the order in which they run: all of a camera's pass for each image, then the frame's.
+///
+/// # Errors
+/// The first of `step`.
+pub(crate) fn walk(graph: &Graph, scene: &Scene, step: &mut Step<'_>) -> Result<(), Failure> {
+    let mut features: Vec<Tensors> = vec![];
     for image in &scene.images {
-        let mut tensors = BTreeMap::new();
+        let mut tensors = Tensors::new();
         for operation in &graph.operations[..graph.camera_operations] {
-            if let Op::Normalise(_) = operation.op {
-                let image = ops::normalise(gpu, &image.bgr, [image.height, image.width], network.image);
-                walk.keep(operation, &image);
-                tensors.insert(operation.output().0, image);
-            } else {
-                walk.operation(operation, &mut tensors, &[])?;
-            }
+            step(operation, Some(image), &mut tensors, &[])?;
         }
         tensors.retain(|&id, _| graph.tensors[id].lifetime == Lifetime::Camera);
         features.push(tensors);
     }
-    let mut tensors = std::mem::take(&mut walk.frame);
+    let mut tensors = Tensors::new();
     for operation in &graph.operations[graph.camera_operations..] {
-        walk.operation(operation, &mut tensors, &features)?;
+        step(operation, None, &mut tensors, &features)?;
     }
-    let mut stages = walk.stages;
-    for (level, pair) in matrices.iter().enumerate() {
-        for (matrix, kind) in pair.iter().zip(["volume", "bev"]) {
-            for (numbers, part) in [(&matrix.ptr, "ptr"), (&matrix.col, "col")] {
-                stages.push(Stage {
-                    name: format!("level{}.csr_{kind}.{part}", level + 1),
-                    dtype: Dtype::I64,
-                    shape: vec![numbers.len()],
-                    bytes: numbers.iter().flat_map(|&n| i64::from(n).to_le_bytes()).collect(),
-                });
-            }
+    Ok(())
+}
+
+/// Named results, in running order.
+#[derive(Default)]
+pub(crate) struct Stages(Vec<Stage>);
+
+impl Stages {
+    /// Keeps the result of `operation` if it has a name. Those of cameras follow one another.
+    pub(crate) fn keep(&mut self, graph: &Graph, operation: &Operation, tensor: &Tensor, dtype: Dtype, bytes: Vec<u8>) {
+        let Some(name) = &operation.stage else { return };
+        if let Some(stage) = self.0.iter_mut().find(|s| s.name == *name) {
+            stage.shape[0] += 1;
+            stage.bytes.extend(bytes);
+            return;
+        }
+        let extent = match graph.tensor(operation.output()).space {
+            Space::Volume => &tensor.extent[..],
+            Space::Image | Space::Plane => &tensor.extent[1..],
+        };
+        let shape = [1, tensor.channels].into_iter().chain(extent.iter().copied()).collect();
+        self.0.push(Stage { name: name.clone(), dtype, shape, bytes });
+    }
+
+    /// Keeps what a head gave for the voxels of `extent`: logits `[voxels, classes]`, and of the last head the classes.
+    pub(crate) fn keep_head(
+        &mut self,
+        graph: &Graph,
+        operation: &Operation,
+        extent: [usize; 3],
+        logits: &[f32],
+        largest: &[u32],
+    ) {
+        if let Some(name) = &operation.stage {
+            let shape = extent.into_iter().chain([logits.len() / largest.len()]).collect();
+            self.0.push(Stage { name: name.clone(), dtype: Dtype::F32, shape, bytes: floats(logits) });
+        }
+        if graph.tensor(operation.output()).scope == Scope::Output {
+            let bytes = largest.iter().map(|&c| c as u8).collect();
+            self.0.push(Stage { name: "classes".to_owned(), dtype: Dtype::U8, shape: extent.to_vec(), bytes });
         }
     }
-    Ok(stages)
+
+    /// All of them, and the matrices.
+    pub(crate) fn with(self, matrices: &Matrices) -> Vec<Stage> {
+        let mut stages = self.0;
+        for (level, pair) in matrices.iter().enumerate() {
+            for (matrix, kind) in pair.iter().zip(["volume", "bev"]) {
+                for (numbers, part) in [(&matrix.ptr, "ptr"), (&matrix.col, "col")] {
+                    stages.push(Stage {
+                        name: format!("level{}.csr_{kind}.{part}", level + 1),
+                        dtype: Dtype::I64,
+                        shape: vec![numbers.len()],
+                        bytes: numbers.iter().flat_map(|&n| i64::from(n).to_le_bytes()).collect(),
+                    });
+                }
+            }
+        }
+        stages
+    }
+}
+
+/// Puts the result of `operation` among `tensors`: whole, or as some channels of a wide one.
+pub(crate) fn place(gpu: &Gpu, graph: &Graph, operation: &Operation, y: &Tensor, tensors: &mut Tensors) {
+    let output = graph.tensor(operation.output());
+    if operation.channels == output.channels {
+        tensors.insert(operation.output().0, y.clone());
+    } else {
+        // Branches side by side in one tensor.
+        let wide = tensors.entry(operation.output().0).or_insert_with(|| Tensor {
+            extent: output.extent,
+            channels: output.channels,
+            buffer: gpu.zeros(output.len()),
+        });
+        wide.write(gpu, operation.first_channel, y);
+    }
+}
+
+/// The features that a gather reads, of every camera.
+pub(crate) fn maps<'t>(operation: &Operation, features: &'t [Tensors]) -> Vec<&'t Tensor> {
+    features.iter().map(|tensors| &tensors[&operation.inputs[0].0]).collect()
+}
+
+/// The matrix of a level.
+pub(crate) fn matrix(matrices: &Matrices, level: usize, kind: graph::Matrix) -> &Matrix {
+    &matrices[level][usize::from(kind == graph::Matrix::Bev)]
 }
 
 struct Run<'a> {
     gpu: &'a Gpu,
     graph: &'a Graph,
-    weights: &'a dyn Source,
+    loader: Loader<'a>,
     matrices: &'a Matrices,
-    frame: BTreeMap<usize, Tensor>,
-    stages: Vec<Stage>,
+    stages: Stages,
 }
 
 impl Run<'_> {
-    fn operation(
-        &mut self,
-        operation: &Operation,
-        tensors: &mut BTreeMap<usize, Tensor>,
-        features: &[BTreeMap<usize, Tensor>],
-    ) -> Result<(), Failure> {
+    fn operation(&mut self, operation: &Operation, tensors: &mut Tensors, features: &[Tensors]) -> Result<(), Failure> {
         let input = |i: usize| &tensors[&operation.inputs[i].0];
         let mut y = match (&operation.op, operation.op.description().shader(&self.graph.site(operation))) {
             (_, Some(shader)) => self.shader(operation, &shader, &input)?,
             (Op::WindowAttention(attention), None) => {
-                self.attention(&operation.name, input(0), attention.shape.heads, attention.shape.key_dim)?
+                self.loader.attention(&operation.name, input(0), attention.shape.heads, attention.shape.key_dim)?
             }
-            (&Op::Gather(Gather { level, matrix, first_channel: 0 }), None) => {
-                let maps: Vec<&Tensor> = features.iter().map(|f| &f[&operation.inputs[0].0]).collect();
-                let index = usize::from(matrix == graph::Matrix::Bev);
+            (&Op::Gather(Gather { level, matrix: kind, first_channel: 0 }), None) => {
                 let extent = self.graph.tensor(operation.output()).extent;
-                ops::gather(self.gpu, &self.matrices[level][index], &maps, extent)
+                ops::gather(self.gpu, matrix(self.matrices, level, kind), &maps(operation, features), extent)
             }
             (Op::Head(head), None) => return self.head(operation, head.classes, input(0)),
             (op, None) => {
@@ -130,19 +214,9 @@ impl Run<'_> {
         if let Some((residual, true)) = residual {
             y = ops::add(self.gpu, &y, residual);
         }
-        let output = self.graph.tensor(operation.output());
-        if operation.channels == output.channels {
-            tensors.insert(operation.output().0, y.clone());
-        } else {
-            // Branches side by side in one tensor.
-            let wide = tensors.entry(operation.output().0).or_insert_with(|| Tensor {
-                extent: output.extent,
-                channels: output.channels,
-                buffer: self.gpu.zeros(output.len()),
-            });
-            wide.write(self.gpu, operation.first_channel, &y);
-        }
-        self.keep(operation, &y);
+        place(self.gpu, self.graph, operation, &y, tensors);
+        let bytes = floats(&self.gpu.read(&y.buffer));
+        self.stages.keep(self.graph, operation, &y, Dtype::F32, bytes);
         Ok(())
     }
 
@@ -165,7 +239,7 @@ impl Run<'_> {
         }
         for (name, shape) in &shader.weights {
             buffers.push(match name {
-                Some(name) => self.load(name, shape)?,
+                Some(name) => self.loader.load(name, shape)?,
                 None => gpu.zeros(1),
             });
         }
@@ -176,7 +250,29 @@ impl Run<'_> {
         Ok(Tensor { extent, channels: operation.channels, buffer: gpu.run(shader.name, &words, &buffers, len) })
     }
 
-    fn attention(&self, prefix: &str, x: &Tensor, heads: usize, dim: usize) -> Result<Tensor, Failure> {
+    fn head(&mut self, operation: &Operation, classes: usize, x: &Tensor) -> Result<(), Failure> {
+        let layer = |i: usize, outputs: usize| -> Result<[Buffer; 2], Failure> {
+            let weight = self.loader.load(&format!("{}.{i}.weight", operation.name), &[outputs, x.channels])?;
+            Ok([weight, self.loader.load(&format!("{}.{i}.bias", operation.name), &[outputs])?])
+        };
+        let layers = [layer(0, x.channels)?, layer(2, x.channels)?, layer(4, classes)?];
+        let (logits, largest) = ops::head(self.gpu, x, &layers);
+        let (logits, largest) = (self.gpu.read::<f32>(&logits), self.gpu.read::<u32>(&largest));
+        self.stages.keep_head(self.graph, operation, x.extent, &logits, &largest);
+        Ok(())
+    }
+}
+
+/// The checkpoint's weights.
+#[derive(Clone, Copy)]
+pub(crate) struct Loader<'a> {
+    pub(crate) gpu: &'a Gpu,
+    pub(crate) weights: &'a dyn Source,
+}
+
+impl Loader<'_> {
+    /// Cascaded attention with the weights of `prefix`.
+    pub(crate) fn attention(&self, prefix: &str, x: &Tensor, heads: usize, dim: usize) -> Result<Tensor, Failure> {
         let side = WINDOW.min(x.extent[1]);
         let offsets = format!("{prefix}.attention_biases");
         let offsets =
@@ -199,46 +295,6 @@ impl Run<'_> {
         Ok(ops::window_attention(self.gpu, x, WINDOW, &weights, &proj))
     }
 
-    fn head(&mut self, operation: &Operation, classes: usize, x: &Tensor) -> Result<(), Failure> {
-        let layer = |i: usize, outputs: usize| -> Result<[Buffer; 2], Failure> {
-            let weight = self.load(&format!("{}.{i}.weight", operation.name), &[outputs, x.channels])?;
-            Ok([weight, self.load(&format!("{}.{i}.bias", operation.name), &[outputs])?])
-        };
-        let layers = [layer(0, x.channels)?, layer(2, x.channels)?, layer(4, classes)?];
-        let (logits, largest) = ops::head(self.gpu, x, &layers);
-        if let Some(name) = &operation.stage {
-            let shape = x.extent.into_iter().chain([classes]).collect();
-            let bytes = floats(&self.gpu.read::<f32>(&logits));
-            self.stages.push(Stage { name: name.clone(), dtype: Dtype::F32, shape, bytes });
-        }
-        if self.graph.tensor(operation.output()).scope == Scope::Output {
-            self.stages.push(Stage {
-                name: "classes".to_owned(),
-                dtype: Dtype::U8,
-                shape: x.extent.to_vec(),
-                bytes: self.gpu.read::<u32>(&largest).iter().map(|&c| c as u8).collect(),
-            });
-        }
-        Ok(())
-    }
-
-    /// Reads a stage back. Those of cameras follow one another.
-    fn keep(&mut self, operation: &Operation, tensor: &Tensor) {
-        let Some(name) = &operation.stage else { return };
-        let bytes = floats(&self.gpu.read::<f32>(&tensor.buffer));
-        if let Some(stage) = self.stages.iter_mut().find(|s| s.name == *name) {
-            stage.shape[0] += 1;
-            stage.bytes.extend(bytes);
-            return;
-        }
-        let extent = match self.graph.tensor(operation.output()).space {
-            Space::Volume => &tensor.extent[..],
-            Space::Image | Space::Plane => &tensor.extent[1..],
-        };
-        let shape = [1, tensor.channels].into_iter().chain(extent.iter().copied()).collect();
-        self.stages.push(Stage { name: name.clone(), dtype: Dtype::F32, shape, bytes });
-    }
-
     fn norm(&self, prefix: &str, channels: usize) -> Result<Norm, Failure> {
         let part = |name: &str| self.load(&format!("{prefix}.{name}"), &[channels]);
         Ok(Norm {
@@ -255,6 +311,6 @@ impl Run<'_> {
     }
 }
 
-fn floats(values: &[f32]) -> Vec<u8> {
+pub(crate) fn floats(values: &[f32]) -> Vec<u8> {
     values.iter().flat_map(|v| v.to_le_bytes()).collect()
 }
