@@ -110,9 +110,7 @@ pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{
-        Fill, Rng, assert_close, assert_lively, assert_order_shows, assert_same_bits, pad_rows, reverse_columns,
-    };
+    use crate::testing::{Fill, Rng, assert_lively, assert_order_shows, assert_same_bits, pad_rows, reverse_columns};
 
     struct Case {
         shape: [usize; 3],
@@ -192,24 +190,6 @@ mod tests {
         (case.volume, case.bev) = (reverse_columns(&case.volume, 64), reverse_columns(&case.bev, 64));
         case.weights.reverse();
         assert_order_shows(&reverse_columns(&case.all(Isa::Scalar), 64), &want, "channels");
-    }
-
-    #[test]
-    fn the_scalar_code_agrees_with_f64() {
-        for shape in SHAPES {
-            let mut case = Case::new(shape, 12, Rng::ordinary);
-            let [_, depth, c] = shape;
-            case.weights = pad_rows(&Rng::new(13).ordinary(c), c, 0.0);
-            let want: Vec<f64> = (0..case.volume.len())
-                .map(|i| {
-                    let voxel = &case.volume[i / c * c..][..c];
-                    let products = voxel.iter().zip(&case.weights).map(|(x, w)| f64::from(*x) * f64::from(*w));
-                    let gate = 1.0 / (1.0 + (-(products.sum::<f64>() + f64::from(case.bias))).exp());
-                    f64::from(case.volume[i]) + gate * f64::from(case.bev[i / (c * depth) * c + i % c])
-                })
-                .collect();
-            assert_close(&case.all(Isa::Scalar), &want, 1e-6, &format!("{shape:?}"));
-        }
     }
 
     fn case() -> Case {

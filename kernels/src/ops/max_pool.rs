@@ -197,32 +197,6 @@ mod tests {
     }
 
     #[test]
-    fn the_scalar_code_agrees_with_a_padded_image() {
-        for (shape, [kernel, stride, padding]) in SHAPES {
-            let [h, w, c] = shape;
-            let input = Rng::new(6).ordinary(h * w * c);
-            let args = args(&input, shape, [kernel, stride, padding]);
-            let (ph, pw) = (h + 2 * padding, w + 2 * padding);
-            let mut padded = vec![f64::NEG_INFINITY; ph * pw * c];
-            for (i, &v) in input.iter().enumerate() {
-                let (y, x) = (i / (w * c) + padding, i / c % w + padding);
-                padded[(y * pw + x) * c + i % c] = f64::from(v);
-            }
-            let mut want = Vec::new();
-            for y in (0..=ph - kernel).step_by(stride) {
-                for x in (0..=pw - kernel).step_by(stride) {
-                    want.extend((0..c).map(|c_at| {
-                        let taps = (y..y + kernel).flat_map(|y| (x..x + kernel).map(move |x| (y * pw + x) * c + c_at));
-                        taps.map(|at| padded[at]).fold(f64::NEG_INFINITY, f64::max)
-                    }));
-                }
-            }
-            let got: Vec<f64> = all(Isa::Scalar, &args).into_iter().map(f64::from).collect();
-            assert_eq!(got, want, "{shape:?}");
-        }
-    }
-
-    #[test]
     #[should_panic(expected = "an extent is zero")]
     fn no_stride() {
         let input = [0.0; 4];
