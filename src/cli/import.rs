@@ -72,7 +72,7 @@ impl Import {
         }
         bar.finish_and_clear();
         terminal::say(&checkpoint.notes());
-        terminal::say(&Vec::from_iter(unused(&checkpoint).map(|note| note.in_file(&self.checkpoint))));
+        terminal::say(&Vec::from_iter(checkpoint.unused_note()));
         let model = Model::open(&self.output)?;
         println!(
             "{}: {} weights, {}, checksum {:016x}",
@@ -83,19 +83,6 @@ impl Import {
         );
         Ok(())
     }
-}
-
-/// Ends of names that training keeps for itself: counters of batch norms and of moving averages.
-const COUNTERS: [&str; 3] = ["num_batches_tracked", "steps", "n_averaged"];
-
-/// What the checkpoint has and the network does not: it would change the result if it belonged to it.
-fn unused(checkpoint: &Checkpoint) -> Option<Note> {
-    let is_counter = |name: &str| COUNTERS.contains(&name.rsplit('.').next().unwrap_or(name));
-    let unused: Vec<&str> = checkpoint.unused().filter(|name| !is_counter(name)).collect();
-    let shown: Vec<String> = unused.iter().take(3).map(|name| format!("{name:?}")).collect();
-    let more = if unused.len() > 3 { ", ..." } else { "" };
-    let message = format!("{} tensors that the network does not have: {}{more}", unused.len(), shown.join(", "));
-    (!unused.is_empty()).then(|| Note::new(message))
 }
 
 /// A built-in network by name, or one from a JSON file.
