@@ -66,15 +66,16 @@ impl Evaluation {
 
     /// Scores the frames that are left, `workers` at a time with `threads` in all. `watch` is called with the number of
     /// frames done, a few times a second; what it raises ends the evaluation.
-    #[pyo3(signature = (*, workers = 1, threads = None, isa = None, watch = None))]
+    #[pyo3(signature = (*, workers = None, threads = None, isa = None, watch = None))]
     fn run(
         &self,
         py: Python<'_>,
-        workers: usize,
+        workers: Option<usize>,
         threads: Option<usize>,
         isa: Option<&str>,
         watch: Option<Py<PyAny>>,
     ) -> Outcome {
+        let workers = workers.unwrap_or(Means::WORKERS);
         if workers == 0 {
             return Err(PyValueError::new_err("workers: found 0, expected at least 1").into());
         }

@@ -111,6 +111,12 @@ pub struct Means {
     pub isa: Isa,
 }
 
+impl Means {
+    /// Frames at a time where nobody says how many: one, which takes the least memory, on every machine the same. The program
+    /// and the Python package have it from here; `benches/workers.rs` compares it with more.
+    pub const WORKERS: usize = 1;
+}
+
 /// One or two predictors, the data set on which they are scored, and how.
 pub struct Evaluation {
     set: Box<dyn DataSet>,
