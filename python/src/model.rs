@@ -1,6 +1,6 @@
 //! Models, and how they are made of checkpoints.
 
-use crate::error::{Failure, Outcome};
+use crate::error::{Failure, Outcome, warn};
 use crate::machine;
 use numpy::{PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::exceptions::PyTypeError;
@@ -170,13 +170,19 @@ pub(crate) fn network_json(name: &str) -> Outcome<String> {
 #[pyfunction]
 pub(crate) fn import_file(py: Python<'_>, checkpoint: PathBuf, wish: Wish) -> Outcome<Model> {
     let plan = wish.plan()?;
-    py.detach(|| {
+    let (model, notes) = py.detach(|| -> Outcome<_> {
         let source = Checkpoint::open(&checkpoint)?;
-        plan.import(&source).map_err(|failure| match failure {
+        let model = plan.import(&source).map_err(|failure| match failure {
             Failure::Library(error) => Failure::Library(error.in_file(&checkpoint)),
             other => other,
-        })
-    })
+        })?;
+        let mut notes = source.notes();
+        notes.extend(source.unused_note());
+        Ok((model, notes))
+    })?;
+    // `import_checkpoint` stands between this and who calls it.
+    warn(py, &notes, 2)?;
+    Ok(model)
 }
 
 /// Imports a dict of float32 or float64 arrays.

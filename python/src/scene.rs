@@ -1,7 +1,7 @@
 //! Images and calibration.
 
 use crate::arrays::lend;
-use crate::error::Outcome;
+use crate::error::{Outcome, warn};
 use crate::images::{unfit, with_images};
 use crate::model::Model;
 use numpy::ndarray::Ix3;
@@ -59,7 +59,8 @@ impl Scene {
     /// Reads a directory with calibration.json and its images, or a .safetensors with `images` and `lidar2img`.
     #[staticmethod]
     fn open(py: Python<'_>, path: PathBuf) -> Outcome<Self> {
-        let scene = py.detach(|| voxcast::Scene::open(&path))?;
+        let (scene, notes) = py.detach(|| voxcast::Scene::open_with_notes(&path))?;
+        warn(py, &notes, 1)?;
         Ok(Self { scene, truth: None })
     }
 

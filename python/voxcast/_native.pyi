@@ -209,7 +209,7 @@ class Evaluation:
     def run(
         self,
         *,
-        workers: int = 1,
+        workers: int | None = None,
         threads: int | None = None,
         isa: str | None = None,
         watch: Callable[[int], object] | None = None,

@@ -110,8 +110,7 @@ impl Import {
                 let network = read_network(network)?;
                 let checkpoint = Checkpoint::open(&self.checkpoint)?;
                 self.convert(&checkpoint, &network, precision, checkpoint.notes())?;
-                let unused = unused(&checkpoint).map(|note| note.in_file(&self.checkpoint));
-                terminal::say(&Vec::from_iter(unused));
+                terminal::say(&Vec::from_iter(checkpoint.unused_note()));
                 Ok(())
             }
         }
@@ -241,19 +240,6 @@ fn steps(bar: &ProgressBar) -> impl FnMut(usize, usize) + '_ {
 fn usage(expected: &str) -> Result<()> {
     let message = format!("expected {expected}");
     super::Arguments::command().error(clap::error::ErrorKind::ArgumentConflict, message).exit()
-}
-
-/// Ends of names that training keeps for itself: counters of batch norms and of moving averages.
-const COUNTERS: [&str; 3] = ["num_batches_tracked", "steps", "n_averaged"];
-
-/// What the checkpoint has and the network does not: it would change the result if it belonged to it.
-fn unused(checkpoint: &Checkpoint) -> Option<Note> {
-    let is_counter = |name: &str| COUNTERS.contains(&name.rsplit('.').next().unwrap_or(name));
-    let unused: Vec<&str> = checkpoint.unused().filter(|name| !is_counter(name)).collect();
-    let shown: Vec<String> = unused.iter().take(3).map(|name| format!("{name:?}")).collect();
-    let more = if unused.len() > 3 { ", ..." } else { "" };
-    let message = format!("{} tensors that the network does not have: {}{more}", unused.len(), shown.join(", "));
-    (!unused.is_empty()).then(|| Note::new(message))
 }
 
 /// A built-in network by name, or one from a JSON file.

@@ -12,6 +12,7 @@ mod published;
 pub mod semantickitti;
 pub mod sscbench;
 mod synthetic;
+pub mod uniocc;
 
 pub use crate::base::pose::Pose;
 pub use named::{FORMS, Named};
@@ -21,10 +22,12 @@ pub use published::Published;
 pub use semantickitti::SemanticKitti;
 pub use sscbench::SscBench;
 pub use synthetic::Synthetic;
+pub use uniocc::UniOcc;
 
 pub use crate::network::{Axes, Grid};
 
 use crate::base::error::{Error, Result};
+use crate::base::note::Note;
 use crate::scene::Scene;
 use std::path::{Component, Path};
 
@@ -66,6 +69,8 @@ pub struct Frame {
     pub scene: Scene,
     /// The labels.
     pub truth: Truth,
+    /// What is to be said of the images ([`DataSet::scene`]).
+    pub notes: Vec<Note>,
 }
 
 /// Frames with labels.
@@ -107,7 +112,20 @@ pub trait DataSet: Send + Sync {
     ///
     /// # Panics
     /// If there is no such frame.
-    fn frame(&self, index: usize) -> Result<Frame>;
+    fn frame(&self, index: usize) -> Result<Frame> {
+        let (scene, notes) = self.scene(index)?;
+        Ok(Frame { scene, truth: self.truth(index)?, notes })
+    }
+
+    /// Reads images and calibration of frame `index` alone, and notes what in them is not obeyed or hardly ever meant, as
+    /// [`Scene::open_with_notes`] does.
+    ///
+    /// # Errors
+    /// As [`DataSet::frame`].
+    ///
+    /// # Panics
+    /// If there is no such frame.
+    fn scene(&self, index: usize) -> Result<(Scene, Vec<Note>)>;
 
     /// Reads the labels of frame `index` alone.
     ///

@@ -5,8 +5,9 @@
 //! sweep alone occupies (`.bin`) and what is `.occluded` from every place are no part of the score, and not read.
 
 use super::kitti::{GRID, check_pose, numbers, product, rows};
-use super::{DataSet, Frame, Grid, IGNORED, Truth};
+use super::{DataSet, Grid, IGNORED, Truth};
 use crate::base::error::{Error, Result};
+use crate::base::note::Note;
 use crate::image::file::read_image;
 use crate::scene::matrix::check_intrinsic;
 use crate::scene::{Scene, check_finite};
@@ -245,17 +246,18 @@ impl DataSet for SemanticKitti {
         &self.frames[index].id
     }
 
-    fn frame(&self, index: usize) -> Result<Frame> {
+    fn scene(&self, index: usize) -> Result<(Scene, Vec<Note>)> {
         let frame = &self.frames[index];
         let sequence = &self.sequences[frame.sequence];
+        let mut notes = Vec::new();
         let mut scene = Scene { names: Vec::new(), images: Vec::new(), lidar2img: Vec::new() };
         for camera in &sequence.cameras {
             let path = sequence.directory.join(camera.name).join(format!("{}.png", frame.stem()));
-            scene.images.push(read_image(&path, camera.name, None, &mut Vec::new())?);
+            scene.images.push(read_image(&path, camera.name, None, &mut notes)?);
             scene.names.push(camera.name.to_owned());
             scene.lidar2img.push(camera.lidar2img);
         }
-        Ok(Frame { scene, truth: self.truth(index)? })
+        Ok((scene, notes))
     }
 
     fn truth(&self, index: usize) -> Result<Truth> {

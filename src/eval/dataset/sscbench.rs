@@ -6,8 +6,9 @@
 //! invalid in them; `voxels/*.{bin,label,invalid}`, from which they were made, are not read.
 
 use super::kitti::{GRID, check_pose, matrix, numbers, parse, product, rows, values};
-use super::{DataSet, Frame, Grid, Truth, check_labels};
+use super::{DataSet, Grid, Truth, check_labels};
 use crate::base::error::{Error, Result};
+use crate::base::note::Note;
 use crate::file::npz::read_npy_integers;
 use crate::image::file::read_image;
 use crate::scene::{Scene, check_finite};
@@ -157,18 +158,19 @@ impl DataSet for SscBench {
         &self.frames[index]
     }
 
-    fn frame(&self, index: usize) -> Result<Frame> {
+    fn scene(&self, index: usize) -> Result<(Scene, Vec<Note>)> {
         let (drive, number) = self.frames[index].split_once('/').unwrap_or_default();
         let directory = self.root.join("data_2d_raw").join(drive).join(CAMERA).join("data_rect");
         // Images of KITTI-360 itself have ten digits.
         let short = directory.join(format!("{number}.png"));
         let path = if short.exists() { short } else { directory.join(format!("{number:0>10}.png")) };
+        let mut notes = Vec::new();
         let scene = Scene {
             names: vec![CAMERA.to_owned()],
-            images: vec![read_image(&path, CAMERA, None, &mut Vec::new())?],
+            images: vec![read_image(&path, CAMERA, None, &mut notes)?],
             lidar2img: vec![self.lidar2img],
         };
-        Ok(Frame { scene, truth: self.truth(index)? })
+        Ok((scene, notes))
     }
 
     fn truth(&self, index: usize) -> Result<Truth> {

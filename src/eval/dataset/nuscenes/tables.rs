@@ -266,7 +266,7 @@ fn entry(
         seen.push(CameraImage { filename: camera.filename, size: camera.size, lidar2img });
     }
     let id = format!("{}/{}", sample.scene, sample.token);
-    Ok(Entry { id, lidar: lidar.filename, cameras: seen, lidar_to_ego: lidar_mount.to_ego })
+    Ok(Entry { id, lidar: lidar.filename, cameras: seen, lidar_to_ego: lidar_mount.to_ego, lidar_to_global })
 }
 
 fn intrinsic(rows: &[Vec<f64>]) -> Result<[[f64; 3]; 3]> {
