@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use voxcast::checkpoint::Checkpoint;
 use voxcast::container::{self, Data, Layout, Tensor};
-use voxcast::graph::{Element, Graph, Results, Rewrites, Section};
+use voxcast::graph::{Element, Graph, Op, Results, Rewrites, Section};
 use voxcast::import::{Integers, Source, import, import_int8};
 use voxcast::model::Options;
 use voxcast::model::ranges::Ranges;
@@ -272,6 +272,20 @@ fn folded_stages_agree() {
         assert!(!graph.stages().any(|s| s == "level1.gather.volume") && graph.stages().any(|s| s == "level1.volume"));
         case.compare("projection folded", &graph, &found, case.tolerance(Precision::F32));
     }
+}
+
+/// The other tests are of Winograd's minimal filtering where it is worth it.
+#[test]
+fn direct_sums_agree() {
+    let mut others = 0;
+    for case in cases() {
+        let graph = case.model(Precision::F32, Rewrites::ALL).graph(false, Results::ALL);
+        others += graph.operations.iter().filter(|o| matches!(o.op, Op::Winograd(_))).count();
+        let model = case.model(Precision::F32, Rewrites { winograd: false, ..Rewrites::ALL });
+        let found = case.run(model.clone(), false, Isa::best());
+        case.compare("direct sums", &model.graph(false, Results::ALL), &found, case.tolerance(Precision::F32));
+    }
+    assert!(others > 0, "no case has a convolution that is worth it");
 }
 
 #[test]

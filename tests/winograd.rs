@@ -10,7 +10,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use voxcast::container::Container;
 use voxcast::graph::{Op, Results, Rewrites, TensorId};
-use voxcast::model::use_winograd;
+use voxcast::import::import_to_bytes;
+use voxcast::model::{Options, use_winograd};
 use voxcast::network::Block;
 use voxcast::weights::Precision;
 use voxcast::{ErrorKind, Model, Network, Session, SessionOptions, digest};
@@ -25,18 +26,25 @@ fn network() -> Network {
         block: Block::Basic,
         dcn: [false; 4],
         width: 32,
-        channels: [16, 16, 16, 32],
-        key_dims: [2, 2, 4],
+        channels: [16, 32, 16, 32],
+        key_dims: [4, 2, 4],
         image: [96, 192],
-        grids: [[24, 28, 4], [12, 14, 2], [6, 7, 1]],
+        grids: [[24, 24, 4], [12, 12, 2], [6, 6, 1]],
         depths: [2, 2, 1, 1],
         ..small::network()
     }
 }
 
+/// A model whose rounding stays as small as it is.
+fn model(network: &Network, precision: Precision, rewrites: Rewrites) -> Arc<Model> {
+    let options = Options { precision, rewrites };
+    let bytes = import_to_bytes(&small::Tempered(1), network, options, &mut |_, _| ()).unwrap();
+    Arc::new(Model::from_bytes(bytes).unwrap())
+}
+
 /// The model of direct sums, and what [`use_winograd`] makes of it.
 fn models(network: &Network, precision: Precision) -> [Arc<Model>; 2] {
-    let exact = small::model(network, precision, EXACT, 1);
+    let exact = model(network, precision, EXACT);
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("model");
     use_winograd(&exact, &path, &mut |_, _| ()).unwrap();
@@ -139,7 +147,7 @@ fn errors_of_every_operation_are_at_most_twice_those_of_direct_sums() {
 fn run(model: &Arc<Model>) -> (Vec<u8>, Vec<f32>) {
     let options = SessionOptions { logits: true, ..SessionOptions::default() };
     let network = model.network();
-    let mut session = Session::new(model.clone(), small::rig(network, 0.3), &options).unwrap();
+    let mut session = Session::new(model.clone(), small::rig(network, 0.0), &options).unwrap();
     let images = Images::new(network, 5);
     let result = session.run(&images.views()).unwrap();
     (result.classes.to_vec(), result.logits.unwrap().to_vec())
@@ -147,13 +155,14 @@ fn run(model: &Arc<Model>) -> (Vec<u8>, Vec<f32>) {
 
 #[test]
 fn direct_sums_have_the_bits_that_they_always_had() {
-    let exact = small::model(&network(), Precision::F32, EXACT, 1);
+    // One camera that looks along an axis: no sine or cosine that another machine might round in another way.
+    let exact = small::model(&Network { cameras: 1, ..network() }, Precision::F32, EXACT, 1);
     let graph = exact.graph(false, Results::default());
     assert!(!graph.operations.iter().any(|o| matches!(o.op, Op::Winograd(_))));
     let file = Container::from_bytes(exact.bytes().to_vec()).unwrap();
     assert!(!file.metadata().contains_key("winograd"), "a file of the form that earlier versions wrote");
     let (_, logits) = run(&exact);
-    assert_eq!(format!("{:016x}", digest::floats(&logits)), "0000000000000000");
+    assert_eq!(format!("{:016x}", digest::floats(&logits)), "9486f5332a5eee28");
 }
 
 #[test]
@@ -161,7 +170,7 @@ fn a_model_of_direct_sums_becomes_one_that_uses_winograd() {
     let network = network();
     for precision in [Precision::F32, Precision::F16] {
         let [exact, transformed] = models(&network, precision);
-        let imported = small::model(&network, precision, Rewrites::ALL, 1);
+        let imported = model(&network, precision, Rewrites::ALL);
         assert_eq!(transformed.options(), imported.options());
         assert!(transformed.tensors().eq(imported.tensors()), "names, types and sizes");
         let [old, new] = [&exact, &transformed].map(|model| Container::from_bytes(model.bytes().to_vec()).unwrap());

@@ -197,9 +197,9 @@ pub(crate) fn import_tensors(py: Python<'_>, tensors: &Bound<'_, PyDict>, wish: 
 }
 
 /// How a model is to be made, as `import_checkpoint` hands it on: the network as JSON, the output, precision, fold, whether
-/// there is to be a self-test, and on how many threads.
+/// convolutions are direct sums, whether there is to be a self-test, and on how many threads.
 #[derive(FromPyObject)]
-pub(crate) struct Wish(String, Option<PathBuf>, String, String, bool, Option<usize>);
+pub(crate) struct Wish(String, Option<PathBuf>, String, String, bool, bool, Option<usize>);
 
 /// How a model is made, and where it goes.
 struct Plan {
@@ -211,7 +211,7 @@ struct Plan {
 
 impl Wish {
     fn plan(self) -> Outcome<Plan> {
-        let Self(network, output, precision, fold, self_test, threads) = self;
+        let Self(network, output, precision, fold, exact, self_test, threads) = self;
         let one_of = |what: &str, found: &str, expected: &str| {
             Failure::Python(PyTypeError::new_err(format!("{what}: found {found:?}, expected {expected}")))
         };
@@ -224,6 +224,7 @@ impl Wish {
             "none" => Rewrites::NONE,
             other => return Err(one_of("fold", other, "\"all\", \"batch-norm\" or \"none\"")),
         };
+        let rewrites = Rewrites { winograd: rewrites.winograd && !exact, ..rewrites };
         let self_test = self_test.then(|| machine::threads(threads)).transpose()?;
         Ok(Plan { network, options: Options { precision, rewrites }, output, self_test })
     }

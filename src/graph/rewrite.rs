@@ -62,11 +62,15 @@ impl Graph {
 
     /// Computes convolutions by Winograd's minimal filtering where [`Shape::best`] says so: from their shapes alone. What they
     /// read and write, and all that surrounds them, stays. Nothing that folds convolutions may come after it.
+    ///
+    /// Transformed weights may take as much memory as the maps where every camera's pass reads them, and half as much where they
+    /// are read once in a frame.
     #[must_use]
     pub fn use_winograd(mut self) -> Self {
-        for operation in &mut self.operations {
+        for (index, operation) in self.operations.iter_mut().enumerate() {
             let Op::Conv(Conv { geometry }) = operation.op else { continue };
-            if let Some(shape) = Shape::best(&geometry, operation.channels) {
+            let share = if index < self.camera_operations { 1 } else { 2 };
+            if let Some(shape) = Shape::best(&geometry, operation.channels, share) {
                 operation.op = Winograd { geometry, shape }.into();
             }
         }

@@ -152,14 +152,15 @@ fn winograd_saves_work_and_leaves_all_else() {
         let graph = direct.clone().use_winograd();
         assert_eq!((&graph.tensors, graph.camera_operations), (&direct.tensors, direct.camera_operations));
         assert_eq!(graph.operations.len(), direct.operations.len());
-        for (new, old) in graph.operations.iter().zip(&direct.operations) {
+        for (index, (new, old)) in graph.operations.iter().zip(&direct.operations).enumerate() {
             assert_eq!(graph.multiply_adds(new), direct.multiply_adds(old), "{}", old.name);
             match new.op {
                 Op::Winograd(Winograd { shape, geometry }) => {
                     assert_eq!(Op::from(Conv { geometry }), old.op, "{}", old.name);
                     assert!(2 * graph.executed_multiply_adds(new) < graph.multiply_adds(new), "{}", old.name);
                     let maps = graph.tensor(new.inputs[0]).len() + geometry.rows() * new.channels;
-                    assert!(shape.weights_len() <= maps, "{}", old.name);
+                    let most = if index < graph.camera_operations { maps } else { maps / 2 };
+                    assert!(shape.weights_len() <= most, "{}", old.name);
                 }
                 _ => assert_eq!(new, old),
             }
@@ -172,7 +173,7 @@ fn winograd_saves_work_and_leaves_all_else() {
         executed.push((graph.operations.iter().filter(|o| count(o)).count(), all as f64 / left as f64));
     }
     for (count, saved) in executed {
-        assert!(count >= 19 && saved > 2.5, "{count} operations, {saved:.2} times fewer multiply-adds");
+        assert!(count >= 14 && saved > 2.3, "{count} operations, {saved:.2} times fewer multiply-adds");
     }
 }
 

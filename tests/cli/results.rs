@@ -216,6 +216,35 @@ fn an_imported_model_tests_the_machine() {
 }
 
 #[test]
+fn direct_sums_are_kept_or_transformed() {
+    let place = Place::ready();
+    let [network, weights, scene, exact, model] =
+        ["network.json", "weights.pth", "scene", "exact", "transformed"].map(|f| place.text(f));
+    done(&["import", &weights, "--network", &network, "--exact", "-o", &exact]);
+    done(&["import", &exact, "-o", &model]);
+    let told = |model: &str| -> Value { serde_json::from_str(&done(&["inspect", model, "--json"])).unwrap() };
+    let [kept, used] = [&exact, &model].map(|model| told(model));
+    assert_eq!((&kept["winograd_used"], &used["winograd_used"]), (&json!(false), &json!(true)));
+    assert_eq!(
+        (&kept["executed_multiply_adds"], &kept["multiply_adds"]),
+        (&used["multiply_adds"], &used["multiply_adds"])
+    );
+    assert!(used["executed_multiply_adds"].as_u64() < used["multiply_adds"].as_u64());
+    assert!(done(&["inspect", &model, "--operations"]).contains("conv3d F(4,3)"));
+    assert!(!done(&["inspect", &exact, "--operations"]).contains("F(4,3)"));
+    assert!(done(&["selftest", &model]).contains("give what they must"));
+    let logits = |model: &str| -> Value {
+        let arguments = ["run", "--model", model, &scene, "-o", &place.text("o.npz"), "--logits", "--json"];
+        serde_json::from_str::<Value>(&done(&arguments)).unwrap()["logits_digest"].clone()
+    };
+    assert_ne!(logits(&exact), logits(&model), "other roundings");
+    assert!(refused(&model, &["import", &model, "-o", &exact]).contains("already"));
+    let output = voxcast(&["import", &weights, "-o", &place.text("none")]);
+    assert_eq!((output.status.code(), place.path("none").exists()), (Some(2), false));
+    assert!(text(&output.stderr).contains("--network, unless the checkpoint is a model"), "{}", text(&output.stderr));
+}
+
+#[test]
 fn comparing_names_the_first_stage_that_differs() {
     let place = Place::ready();
     let [model, scene, out] = ["model", "scene", "out.npz"].map(|f| place.text(f));

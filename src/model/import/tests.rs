@@ -160,8 +160,9 @@ fn transformed_weights_are_those_of_the_direct_convolution() {
         block: crate::network::Block::Basic,
         dcn: [false; 4],
         width: 32,
-        channels: [16, 16, 16, 8],
-        grids: [[16, 16, 4], [8, 8, 2], [4, 4, 1]],
+        channels: [16, 32, 16, 8],
+        key_dims: [4, 2, 1],
+        grids: [[24, 24, 4], [12, 12, 2], [6, 6, 1]],
         ..small::tiny()
     };
     let graph = |winograd| Graph::build(&network, Results::ALL).rewritten(Rewrites { winograd, ..Rewrites::ALL });
@@ -178,7 +179,10 @@ fn transformed_weights_are_those_of_the_direct_convolution() {
             assert_near(*found, expected, &operation.name);
         }
     }
-    assert_eq!(kinds.into_iter().collect::<Vec<_>>(), ["conv2d F(4,3)", "conv3d F(2,3)", "conv3d F(4,3)"]);
+    assert_eq!(
+        kinds.into_iter().collect::<Vec<_>>(),
+        ["conv2d F(2,3)", "conv2d F(4,3)", "conv3d F(2,3)", "conv3d F(4,3)"]
+    );
 }
 
 #[test]
