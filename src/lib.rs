@@ -69,7 +69,7 @@ import(&checkpoint, &network, Options::default(), Path::new("model.safetensors")
 //!   in pixels of the unpadded image. Cameras come in the order of the training.
 //! - Grids are [X, Y, Z] in the lidar frame, z fastest: voxel (x, y, z) is at `(x * Y + y) * Z + z`. [`Network::bounds`]
 //!   are its metres.
-//! - Inside, every tensor is channels last and f32. Weights are f32 or f16.
+//! - Inside, every tensor is channels last; f32 with weights of f32 or f16, or bytes with a scale in models of int8.
 //!
 //! # Memory and threads
 //!

@@ -105,7 +105,7 @@ impl Model {
         palette.classes().iter().map(|class| class.name.clone()).collect()
     }
 
-    /// How weights are stored: "f32" or "f16".
+    /// How weights are stored: "f32", "f16" or "int8".
     #[getter]
     fn precision(&self) -> &'static str {
         self.model.options().precision.name()
@@ -217,7 +217,8 @@ impl Wish {
         };
         let network = Network::from_json(&network)?;
         let unknown = || one_of("precision", &precision, "\"f32\" or \"f16\"");
-        let precision = Precision::parse(&precision).ok_or_else(unknown)?;
+        // int8 needs ranges, which the command line measures.
+        let precision = Precision::parse(&precision).filter(|&p| p != Precision::I8).ok_or_else(unknown)?;
         let rewrites = match fold.as_str() {
             "all" => Rewrites::ALL,
             "batch-norm" => Rewrites { projection: false, ..Rewrites::ALL },
