@@ -95,7 +95,8 @@ impl Run<'_> {
             }
             Kind::Gate { columns: [x, y], depth, channels } => {
                 let columns = case.columns("columns", channels, 1);
-                let [own, other] = [4 << 21, 4 << 11].map(|high| case.integers("factor", 1, high, false)[0]);
+                let factor = |what, high| case.integers(what, 1, high, false)[0];
+                let [own, other] = [factor("own factor", 4 << 21), factor("bev factor", 4 << 11)];
                 let scalars = [columns.bias[0], columns.multiplier[0], own, other];
                 let volume = self.tensor("volume", [x, y, depth], channels, true);
                 let bev = self.tensor("bev", [1, x, y], channels, true);
