@@ -141,7 +141,6 @@ fn errors_of_every_operation_are_at_most_twice_those_of_direct_sums() {
         .iter()
         .map(|name| format!("{name} {}: {:.2e}, direct {:.2e}", kinds[name], here[name], direct[name]))
         .collect();
-    println!("{}", table.join("\n"));
     assert!(names.iter().all(|name| here[name] <= 2.0 * direct[name]), "{}", table.join("\n"));
 }
 
