@@ -221,7 +221,7 @@ impl Controller {
 
 /// Occupied voxels that a camera sees, in the lane ahead: what a controller would brake for.
 fn in_the_way(occupancy: &Occupancy<'_>) -> usize {
-    let [x, y, z] = occupancy.grid;
+    let [x, y, z] = occupancy.grid.size;
     let lane = (x / 2 - x / 32..x / 2 + x / 32).flat_map(|x| (y / 2..y).map(move |y| (x, y)));
     let voxels = lane.flat_map(|(i, j)| (0..z).map(move |k| (i * y + j) * z + k));
     voxels.filter(|&v| occupancy.classes[v] != 0 && occupancy.support[v] > 0).count()

@@ -20,6 +20,6 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     // Every frame. classes[(x * Y + y) * Z + z] is the class of voxel (x, y, z); 0 is empty.
     let occupancy = session.run_scene(&scene)?;
     let occupied = occupancy.classes.iter().filter(|&&class| class != 0).count();
-    println!("{occupied} voxels of {:?} are occupied", occupancy.grid);
+    println!("{occupied} voxels of {:?} are occupied", occupancy.grid.size);
     Ok(())
 }

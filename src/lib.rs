@@ -36,7 +36,7 @@
 //! // Every frame. If the calibration moves, build another rig and pass it to `Session::set_rig`.
 //! let images: Vec<ImageView> = cameras.iter().map(|bgr| ImageView::bgr(900, 1600, bgr)).collect();
 //! let occupancy = session.run(&images)?;
-//! let [_, y, z] = occupancy.grid;
+//! let [_, y, z] = occupancy.grid.size;
 //! let class = occupancy.classes[(10 * y + 20) * z + 3]; // voxel (10, 20, 3); 0 is empty
 //! # let _ = class;
 //! # Ok(())

@@ -9,7 +9,7 @@ use small::Images;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use voxcast::container::{self, Container, Data, Layout, Tensor};
-use voxcast::graph::Rewrites;
+use voxcast::graph::{Graph, Op, Results, Rewrites};
 use voxcast::weights::Precision;
 use voxcast::{ImageView, Isa, Model, Network, Rig, Session, SessionOptions, Threads};
 
@@ -53,13 +53,22 @@ fn assert_varied(bits: &Bits) {
     assert!(classes.len() > 3, "classes {classes:?}");
 }
 
-/// Smaller still: the scalar kernels compute each multiply-add in software unless the build may use the instruction.
+/// Smaller still: the scalar kernels compute each multiply-add in software unless the build may use the instruction. Its finest
+/// volume is wide enough for Winograd's minimal filtering.
 fn tiny() -> Network {
-    Network { image: [32, 64], grids: [[8, 12, 4], [4, 6, 2], [2, 3, 1]], depths: [1; 4], ..small::network() }
+    Network {
+        image: [32, 64],
+        channels: [16, 16, 24, 32],
+        grids: [[8, 12, 4], [4, 6, 2], [2, 3, 1]],
+        depths: [1; 4],
+        ..small::network()
+    }
 }
 
 #[test]
 fn isa_threads_repetition_company_and_rig_swaps_do_not_show() {
+    let graph = Graph::build(&tiny(), Results::ALL).rewritten(Rewrites::ALL);
+    assert!(graph.operations.iter().any(|o| matches!(o.op, Op::Winograd(_))));
     let stored = [
         (Precision::F32, Rewrites::ALL),
         (Precision::F32, Rewrites::NONE),

@@ -9,9 +9,10 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use voxcast::checkpoint::Checkpoint;
 use voxcast::container::{self, Data, Layout, Tensor};
-use voxcast::graph::{Graph, Results, Rewrites, Section};
-use voxcast::import::{Source, import};
+use voxcast::graph::{Element, Graph, Op, Results, Rewrites, Section};
+use voxcast::import::{Integers, Source, import, import_int8};
 use voxcast::model::Options;
+use voxcast::model::ranges::Ranges;
 use voxcast::rig::RigBuilder;
 use voxcast::session::views;
 use voxcast::weights::Precision;
@@ -40,6 +41,8 @@ struct Case {
     tolerance: Value,
     expected: Vec<u8>,
     left_out: BTreeSet<String>,
+    /// The expected stages of an int8 model, and the ranges that it is made from.
+    ranges: Option<(Vec<u8>, Ranges)>,
     rig: Arc<Rig>,
     directory: tempfile::TempDir,
 }
@@ -92,6 +95,10 @@ impl Case {
         let scene = Scene::open(&from.join("scene.safetensors")).unwrap();
         scene.check(&network).unwrap();
         let expected = std::fs::read(from.join("expected.safetensors")).unwrap();
+        let ranges = (entry["int8"] == true).then(|| {
+            let ranges = Ranges::open(&from.join("ranges.json"), &network).unwrap();
+            (std::fs::read(from.join("expected_i8.safetensors")).unwrap(), ranges)
+        });
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("rig");
         write_rig(&SafeTensors::deserialize(&expected).unwrap(), &path);
@@ -104,6 +111,7 @@ impl Case {
             network,
             scene,
             expected,
+            ranges,
             directory,
         }
     }
@@ -125,8 +133,8 @@ impl Case {
         Arc::new(Model::open(&path).unwrap())
     }
 
-    /// Runs every stage there is.
-    fn run(&self, model: Arc<Model>, unfolded: bool, isa: Isa) -> Found {
+    /// A session with every stage there is.
+    fn session(&self, model: Arc<Model>, unfolded: bool, isa: Isa) -> Session {
         let options = SessionOptions {
             isa,
             threads: Threads::new(2).unwrap(),
@@ -135,7 +143,12 @@ impl Case {
             coarse_heads: true,
             ..SessionOptions::default()
         };
-        let mut session = Session::new(model, self.rig.clone(), &options).unwrap();
+        Session::new(model, self.rig.clone(), &options).unwrap()
+    }
+
+    /// Runs every stage there is.
+    fn run(&self, model: Arc<Model>, unfolded: bool, isa: Isa) -> Found {
+        let mut session = self.session(model, unfolded, isa);
         let graph = session.graph().clone();
         let mut stages: Vec<Stage> = vec![];
         let result = session
@@ -261,6 +274,20 @@ fn folded_stages_agree() {
     }
 }
 
+/// The other tests are of Winograd's minimal filtering where it is worth it.
+#[test]
+fn direct_sums_agree() {
+    let mut others = 0;
+    for case in cases() {
+        let graph = case.model(Precision::F32, Rewrites::ALL).graph(false, Results::ALL);
+        others += graph.operations.iter().filter(|o| matches!(o.op, Op::Winograd(_))).count();
+        let model = case.model(Precision::F32, Rewrites { winograd: false, ..Rewrites::ALL });
+        let found = case.run(model.clone(), false, Isa::best());
+        case.compare("direct sums", &model.graph(false, Results::ALL), &found, case.tolerance(Precision::F32));
+    }
+    assert!(others > 0, "no case has a convolution that is worth it");
+}
+
 #[test]
 fn stages_without_any_rewrite_agree() {
     for case in cases() {
@@ -282,6 +309,74 @@ fn half_precision_agrees() {
                 &found,
                 case.tolerance(Precision::F16),
             );
+        }
+    }
+}
+
+/// The elements of a stage, channels first; logits stay channels last.
+fn channels_first<T: Copy>(stage: &str, values: &[T], rows: usize, channels: usize) -> Vec<T> {
+    if stage.starts_with("logits.") {
+        return values.to_vec();
+    }
+    let camera = |x: &[T]| (0..x.len()).map(|i| x[i % rows * channels + i / rows]).collect::<Vec<_>>();
+    values.chunks_exact(rows * channels).flat_map(camera).collect()
+}
+
+/// Int8 models against the reference in integers: every stage of integers, the logits and the classes are equal on every
+/// instruction set. What stays in f32 is within the tolerance of f32.
+#[test]
+fn integers_equal_the_reference() {
+    let cases: Vec<Case> = cases().into_iter().filter(|case| case.ranges.is_some()).collect();
+    assert!(cases.len() >= 2);
+    for case in cases {
+        let (bytes, ranges) = case.ranges.as_ref().unwrap();
+        let expected = SafeTensors::deserialize(bytes).unwrap();
+        let path = case.directory.path().join("model");
+        let integers = Integers { rewrites: Rewrites::ALL, ranges, keep_f32: &[] };
+        import_int8(&*case.weights, &case.network, &integers, &path, &mut |_, _| ()).unwrap();
+        let model = Arc::new(Model::open(&path).unwrap());
+        for isa in Isa::available() {
+            let (mut found, mut floats): (BTreeMap<String, Vec<u8>>, BTreeSet<String>) = Default::default();
+            let mut session = case.session(model.clone(), false, isa);
+            let graph = session.graph().clone();
+            let result = session.run_observed(&views(&case.scene), &mut |event| {
+                let Some(name) = &event.operation.stage else { return };
+                let tensor = graph.tensor(event.operation.result());
+                let (rows, channels) = (tensor.rows(), tensor.channels);
+                let bytes: Vec<u8> = match event.output.element() {
+                    Element::F32 => {
+                        let values = channels_first(name, event.output.of::<f32>(), rows, channels);
+                        values.into_iter().flat_map(f32::to_le_bytes).collect()
+                    }
+                    Element::I32 => {
+                        let values = channels_first(name, event.output.of::<i32>(), rows, channels);
+                        values.into_iter().flat_map(i32::to_le_bytes).collect()
+                    }
+                    _ => channels_first(name, event.output.bytes(), rows, channels),
+                };
+                if event.output.element() == Element::F32 && !name.starts_with("logits.") {
+                    floats.insert(name.clone());
+                }
+                found.entry(name.clone()).or_default().extend(bytes);
+            });
+            found.insert("classes".to_owned(), result.unwrap().classes.to_vec());
+            let names: BTreeSet<&str> = expected.names().into_iter().collect();
+            assert_eq!(found.keys().map(String::as_str).collect::<BTreeSet<_>>(), names, "{}", case.name);
+            assert!(found.len() - floats.len() > 30, "{}: few stages are integers", case.name);
+            let tolerance = case.tolerance(Precision::F32);
+            for (name, found) in &found {
+                let want = expected.tensor(name).unwrap().data();
+                let what = format!("{}, {name} on {}", case.name, isa.name());
+                assert_eq!(found.len(), want.len(), "{what}");
+                if floats.contains(name) {
+                    let stage = Stage { name: "logits.".into(), channels: 1, rows: 1, values: self::floats(found) };
+                    let (max, rms) = difference(&stage, &self::floats(want));
+                    assert!(max <= tolerance.max && rms <= tolerance.rms, "{what}: off by {max:e}, {rms:e}");
+                } else {
+                    let differ = found.iter().zip(want).filter(|(a, b)| a != b).count();
+                    assert_eq!(differ, 0, "{what}: so many of {} bytes differ", want.len());
+                }
+            }
         }
     }
 }

@@ -29,7 +29,7 @@ mod named;
 #[path = "support/operations.rs"]
 mod table;
 
-use table::{After, Case, Kind, table};
+use table::{After, Case, Kind, OFFSETS, QUERY_TAPS, table};
 
 /// Packed weights in either precision.
 enum Packed {
@@ -239,7 +239,7 @@ impl Run<'_> {
         let args = DeformConv2d {
             geometry,
             input: &self.rows("x", positions, inputs),
-            offsets: &channels_last(&self.case.offsets(positions, reach), 27),
+            offsets: &channels_last(&self.case.offsets(positions, reach), OFFSETS),
             product: Product {
                 weights: weights.panels(),
                 bias: &padded(&vec![0.0; outputs]),
@@ -302,7 +302,7 @@ impl Run<'_> {
             let (weight, bias) = folded(format!("qkv.{i}"), 3 * part * part, 3 * part);
             qkv.extend(dense(&weight, part, 3 * part));
             qkv_bias.extend(bias);
-            let (weight, bias) = folded(format!("query.{i}"), part * 25, part);
+            let (weight, bias) = folded(format!("query.{i}"), part * QUERY_TAPS, part);
             query.extend(taps(&weight, part));
             query_bias.extend(bias);
             offsets.extend(self.case.numbers(&format!("offsets.{i}"), shape.side() * shape.side()));

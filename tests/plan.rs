@@ -82,7 +82,12 @@ fn networks() -> impl Strategy<Value = Network> {
 }
 
 fn rewrites() -> impl Strategy<Value = Rewrites> {
-    prop::sample::select(vec![Rewrites::ALL, Rewrites::NONE, Rewrites { projection: false, ..Rewrites::ALL }])
+    prop::sample::select(vec![
+        Rewrites::ALL,
+        Rewrites::NONE,
+        Rewrites { projection: false, ..Rewrites::ALL },
+        Rewrites { winograd: false, ..Rewrites::ALL },
+    ])
 }
 
 /// Operations from the first that writes a tensor to the last that reads it. Features outlive the frame.

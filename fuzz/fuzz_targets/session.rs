@@ -99,8 +99,13 @@ fn model(input: &mut Draw, network: &Network) -> Option<Arc<Model>> {
         assert!(RigBuilder::new(network, 1, Isa::best()).is_err());
         return None;
     }
-    let rewrites = [Rewrites::ALL, Rewrites::NONE, Rewrites { projection: false, ..Rewrites::ALL }];
-    let rewrites = rewrites[input.extent(0, 2)];
+    let rewrites = [
+        Rewrites::ALL,
+        Rewrites::NONE,
+        Rewrites { projection: false, ..Rewrites::ALL },
+        Rewrites { winograd: false, ..Rewrites::ALL },
+    ];
+    let rewrites = rewrites[input.extent(0, 3)];
     let precision = if input.flag() { Precision::F16 } else { Precision::F32 };
     let source =
         Weights { seed: u64::from(input.byte()), factor: [1.0, 1.0, 0.0, 1e3, 1e18, -1e30][input.extent(0, 5)] };

@@ -1,8 +1,8 @@
 //! What is known of every kernel from its line in [`REGISTRY`], which stands in `ops.rs`: how to call it with any arguments,
 //! and at the network's shapes.
 //!
-//! Tests take from it that every instruction set gives the bits of the specification and stays inside its slices, the fuzz
-//! target any shapes and bits, the benchmarks their work. A kernel's part is its module `cases`: a file beside it,
+//! Tests take from it that the specification computes its formula, and that every instruction set gives its bits and stays inside
+//! its slices, the fuzz target any shapes and bits, the benchmarks their work. A kernel's part is its module `cases`: a file beside it,
 //! `ops/KERNEL/cases.rs`, or some lines in its own.
 
 mod bench;
@@ -37,6 +37,20 @@ pub struct Entry {
 pub trait Case {
     /// Calls it with slices in `memory` that are exactly as long as they must be.
     fn run(&self, isa: Isa, memory: Memory) -> Output;
+
+    /// What the formula gives in f64; none of a kernel that its own tests compare with f64.
+    fn exact(&self) -> Option<Exact> {
+        None
+    }
+}
+
+/// What a call should give, but for rounding.
+#[derive(Clone, Debug)]
+pub struct Exact {
+    /// In the order of [`Output::values`].
+    pub values: Vec<f64>,
+    /// How far f32 may be from a value v that was computed of values up to 1: this times 1 + |v|.
+    pub tolerance: f64,
 }
 
 /// What a call returned and wrote.

@@ -67,7 +67,7 @@ pub(crate) trait Simd: Copy {
     /// `sums[r][j] += left[r][k] * panels[j][k]` for k ascending, each a chain of fused multiply-adds.
     ///
     /// # Safety
-    /// Each pointer in `left` must be valid for reading `depth` numbers, each in `panels` for `depth` times [`LANES`].
+    /// Each pointer in `left` must be valid for reading `depth` elements, each in `panels` for `depth` times [`LANES`].
     #[inline(always)]
     unsafe fn multiply<const N: usize, const P: usize>(
         self,

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::io::Write as _;
 use std::path::Path;
 use voxcast_kernels::Isa;
-use voxcast_kernels::cases::{Draw, Entry, Memory, Output, REGISTRY, agree};
+use voxcast_kernels::cases::{Draw, Entry, Exact, Memory, Output, REGISTRY, agree};
 
 /// Draws of each kernel.
 const DRAWS: u64 = 200;
@@ -33,6 +33,32 @@ fn every_isa_gives_the_bits_of_the_specification() {
     for entry in REGISTRY {
         let [outputs, telling] = all(entry, &[Memory::Heap]);
         assert!(telling > 200 && 50 * telling > outputs, "{}: {telling} of {outputs} outputs tell", entry.name);
+    }
+}
+
+/// Of the kernels whose cases are `exact`; products and what is made of them have tests with f64 of their own.
+#[test]
+fn the_specification_agrees_with_f64() {
+    let mut compared = Vec::new();
+    for entry in REGISTRY {
+        let mut values = 0;
+        for case in (0..DRAWS).filter_map(|seed| (entry.draw)(&mut Draw::ordinary(seed))) {
+            let Some(Exact { values: want, tolerance }) = case.exact() else { break };
+            let got = case.run(Isa::Scalar, Memory::Heap).values;
+            assert_eq!(got.len(), want.len(), "{}", entry.name);
+            for (i, (&got, &want)) in got.iter().zip(&want).enumerate() {
+                let error = (f64::from(got) - want).abs();
+                assert!(error <= tolerance * (1.0 + want.abs()), "{}: value {i} is {got:e}, not {want:e}", entry.name);
+            }
+            values += want.len();
+        }
+        if values > 0 {
+            assert!(values > 1000, "{}: {values} values", entry.name);
+            compared.push(entry.name);
+        }
+    }
+    for name in ["depthwise", "gate", "gather", "max_pool", "pool", "scale_shift", "upsample_add"] {
+        assert!(compared.contains(&name), "{name}");
     }
 }
 

@@ -1,7 +1,8 @@
 //! From the library's errors to exceptions with the same one line.
 
 use pyo3::prelude::*;
-use voxcast::{Error, ErrorKind};
+use std::ffi::CString;
+use voxcast::{Error, ErrorKind, Note};
 
 /// Why a call fails.
 pub(crate) enum Failure {
@@ -76,4 +77,18 @@ pub(crate) fn own<'a, T>(mutex: &'a std::sync::Mutex<T>, what: &'static str) -> 
             Err(Error::new(ErrorKind::Unsupported, message).into())
         }
     }
+}
+
+/// Warns of notes, with the category `voxcast.Note`. The caller is `level` frames of Python away, 1 for who called the
+/// function itself. Where warnings are errors, the first one is raised.
+pub(crate) fn warn(py: Python<'_>, notes: &[Note], level: i32) -> PyResult<()> {
+    if notes.is_empty() {
+        return Ok(());
+    }
+    let category = py.import("voxcast._errors")?.getattr("Note")?;
+    for note in notes {
+        let line = CString::new(note.to_string().replace('\0', "\u{fffd}"))?;
+        PyErr::warn(py, &category, &line, level)?;
+    }
+    Ok(())
 }

@@ -1,6 +1,6 @@
 //! Evaluations: at once, or frame by frame on many machines.
 
-use crate::error::{Failure, Outcome, own};
+use crate::error::{Failure, Outcome, own, warn};
 use crate::machine;
 use crate::model::Model;
 use pyo3::exceptions::PyValueError;
@@ -9,6 +9,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 use voxcast::dataset::Named;
 use voxcast::eval::{self, Journal, Means, Predictor, Scope, Shard, Summary, Totals, write_text};
+use voxcast::note::Said;
 use voxcast::{Error, ErrorKind};
 
 /// One model, or two that are compared, on a data set with labels.
@@ -65,15 +66,16 @@ impl Evaluation {
 
     /// Scores the frames that are left, `workers` at a time with `threads` in all. `watch` is called with the number of
     /// frames done, a few times a second; what it raises ends the evaluation.
-    #[pyo3(signature = (*, workers = 1, threads = None, isa = None, watch = None))]
+    #[pyo3(signature = (*, workers = None, threads = None, isa = None, watch = None))]
     fn run(
         &self,
         py: Python<'_>,
-        workers: usize,
+        workers: Option<usize>,
         threads: Option<usize>,
         isa: Option<&str>,
         watch: Option<Py<PyAny>>,
     ) -> Outcome {
+        let workers = workers.unwrap_or(Means::WORKERS);
         if workers == 0 {
             return Err(PyValueError::new_err("workers: found 0, expected at least 1").into());
         }
@@ -82,10 +84,12 @@ impl Evaluation {
         let mut raised = None;
         let State { totals, journal } = &mut *state;
         let done = py.detach(|| {
-            self.evaluation.run(&means, totals, journal.as_mut(), &mut |done| {
+            self.evaluation.run(&means, totals, journal.as_mut(), &mut |done, notes| {
                 Python::attach(|py| {
                     let called = watch.as_ref().map_or(Ok(()), |watch| watch.call1(py, (done,)).map(drop));
-                    py.check_signals().and(called).map_err(|error| {
+                    // `evaluate` stands between this and who calls it.
+                    let warned = warn(py, notes, 2);
+                    py.check_signals().and(called).and(warned).map_err(|error| {
                         raised = Some(error);
                         Error::new(ErrorKind::Unsupported, "the evaluation was interrupted")
                     })
@@ -122,6 +126,7 @@ impl Evaluation {
 #[pyclass(frozen, module = "voxcast")]
 pub(crate) struct Worker {
     worker: Mutex<eval::Worker>,
+    said: Mutex<Said>,
 }
 
 #[pymethods]
@@ -130,7 +135,8 @@ impl Worker {
     #[pyo3(signature = (evaluation, *, threads = None, isa = None))]
     fn new(evaluation: &Evaluation, threads: Option<usize>, isa: Option<&str>) -> Outcome<Self> {
         let (threads, isa) = (machine::threads(threads)?, machine::isa(isa)?);
-        Ok(Self { worker: Mutex::new(eval::Worker::new(evaluation.evaluation.clone(), isa, threads)) })
+        let worker = eval::Worker::new(evaluation.evaluation.clone(), isa, threads);
+        Ok(Self { worker: Mutex::new(worker), said: Mutex::default() })
     }
 
     /// The score of frame `index` of the set as a line of JSON: counts, losses in bits, and the digests of what was predicted.
@@ -138,7 +144,10 @@ impl Worker {
     fn score(&self, py: Python<'_>, index: usize) -> Outcome<String> {
         let mut worker = own(&self.worker, "worker")?;
         let worker = &mut *worker;
-        Ok(py.detach(|| worker.score(index)?.to_line())?)
+        let line = py.detach(|| worker.score(index)?.to_line())?;
+        let notes = worker.take_notes();
+        warn(py, own(&self.said, "worker")?.fresh(notes), 1)?;
+        Ok(line)
     }
 }
 

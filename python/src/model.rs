@@ -1,6 +1,6 @@
 //! Models, and how they are made of checkpoints.
 
-use crate::error::{Failure, Outcome};
+use crate::error::{Failure, Outcome, warn};
 use crate::machine;
 use numpy::{PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::exceptions::PyTypeError;
@@ -170,13 +170,19 @@ pub(crate) fn network_json(name: &str) -> Outcome<String> {
 #[pyfunction]
 pub(crate) fn import_file(py: Python<'_>, checkpoint: PathBuf, wish: Wish) -> Outcome<Model> {
     let plan = wish.plan()?;
-    py.detach(|| {
+    let (model, notes) = py.detach(|| -> Outcome<_> {
         let source = Checkpoint::open(&checkpoint)?;
-        plan.import(&source).map_err(|failure| match failure {
+        let model = plan.import(&source).map_err(|failure| match failure {
             Failure::Library(error) => Failure::Library(error.in_file(&checkpoint)),
             other => other,
-        })
-    })
+        })?;
+        let mut notes = source.notes();
+        notes.extend(source.unused_note());
+        Ok((model, notes))
+    })?;
+    // `import_checkpoint` stands between this and who calls it.
+    warn(py, &notes, 2)?;
+    Ok(model)
 }
 
 /// Imports a dict of float32 or float64 arrays.
@@ -185,15 +191,15 @@ pub(crate) fn import_tensors(py: Python<'_>, tensors: &Bound<'_, PyDict>, wish: 
     let plan = wish.plan()?;
     let mut source = Tensors(HashMap::new());
     for (name, array) in tensors {
-        source.0.insert(name.extract()?, Numbers::of(&array)?);
+        source.0.insert(name.extract()?, Array::of(&array)?);
     }
     py.detach(|| plan.import(&source))
 }
 
 /// How a model is to be made, as `import_checkpoint` hands it on: the network as JSON, the output, precision, fold, whether
-/// there is to be a self-test, and on how many threads.
+/// convolutions are direct sums, whether there is to be a self-test, and on how many threads.
 #[derive(FromPyObject)]
-pub(crate) struct Wish(String, Option<PathBuf>, String, String, bool, Option<usize>);
+pub(crate) struct Wish(String, Option<PathBuf>, String, String, bool, bool, Option<usize>);
 
 /// How a model is made, and where it goes.
 struct Plan {
@@ -205,7 +211,7 @@ struct Plan {
 
 impl Wish {
     fn plan(self) -> Outcome<Plan> {
-        let Self(network, output, precision, fold, self_test, threads) = self;
+        let Self(network, output, precision, fold, exact, self_test, threads) = self;
         let one_of = |what: &str, found: &str, expected: &str| {
             Failure::Python(PyTypeError::new_err(format!("{what}: found {found:?}, expected {expected}")))
         };
@@ -219,6 +225,7 @@ impl Wish {
             "none" => Rewrites::NONE,
             other => return Err(one_of("fold", other, "\"all\", \"batch-norm\" or \"none\"")),
         };
+        let rewrites = Rewrites { winograd: rewrites.winograd && !exact, ..rewrites };
         let self_test = self_test.then(|| machine::threads(threads)).transpose()?;
         Ok(Plan { network, options: Options { precision, rewrites }, output, self_test })
     }
@@ -240,10 +247,10 @@ impl Plan {
 }
 
 /// Weights from memory.
-struct Tensors(HashMap<String, Numbers>);
+struct Tensors(HashMap<String, Array>);
 
 /// An array in row-major order.
-struct Numbers {
+struct Array {
     shape: Vec<usize>,
     values: Values,
 }
@@ -253,7 +260,7 @@ enum Values {
     F64(Vec<f64>),
 }
 
-impl Numbers {
+impl Array {
     fn of(array: &Bound<'_, PyAny>) -> Outcome<Self> {
         if let Ok(array) = array.extract::<PyReadonlyArrayDyn<'_, f32>>() {
             let values = Values::F32(array.as_array().iter().copied().collect());

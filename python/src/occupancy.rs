@@ -72,7 +72,7 @@ impl Occupancy {
     fn classes<'py>(slf: &Bound<'py, Self>) -> Outcome<Bound<'py, PyArray3<u8>>> {
         let view = slf.get().view();
         // SAFETY: the class is frozen; only dropping it gives its memory away.
-        unsafe { lend::<_, Ix3>(view.classes, view.grid, slf.as_any()) }
+        unsafe { lend::<_, Ix3>(view.classes, view.grid.size, slf.as_any()) }
     }
 
     /// uint16 [X, Y, Z], by how many feature pixels each voxel is seen. Where it is 0, no camera sees the place, and its
@@ -81,7 +81,7 @@ impl Occupancy {
     fn support<'py>(slf: &Bound<'py, Self>) -> Outcome<Bound<'py, PyArray3<u16>>> {
         let view = slf.get().view();
         // SAFETY: as for the classes.
-        unsafe { lend::<_, Ix3>(view.support, view.grid, slf.as_any()) }
+        unsafe { lend::<_, Ix3>(view.support, view.grid.size, slf.as_any()) }
     }
 
     /// float32 [X, Y, Z, classes], if the session keeps them; else None.
@@ -90,7 +90,7 @@ impl Occupancy {
         let this = slf.get();
         let view = this.view();
         let Some(logits) = view.logits else { return Ok(None) };
-        let [x, y, z] = view.grid;
+        let [x, y, z] = view.grid.size;
         let shape = (x, y, z, this.model.network().classes);
         // SAFETY: as for the classes.
         Ok(Some(unsafe { lend::<_, Ix4>(logits, shape, slf.as_any()) }?))
@@ -147,7 +147,7 @@ impl Occupancy {
     }
 
     fn __repr__(&self, py: Python<'_>) -> String {
-        let [x, y, z] = self.view().grid;
+        let [x, y, z] = self.view().grid.size;
         format!("Occupancy({x} x {y} x {z} voxels, digest {})", self.digest(py))
     }
 }

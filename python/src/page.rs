@@ -9,7 +9,6 @@ use pyo3::prelude::*;
 use std::path::PathBuf;
 use voxcast::Error;
 use voxcast::eval::write_text;
-use voxcast::network::Grid;
 use voxcast::picture::{self, Palette};
 
 /// A result as one HTML page that needs no network: voxels to turn, truth beside prediction, images with the voxels on them.
@@ -41,15 +40,15 @@ pub(crate) fn view(
     let array: Option<PyReadonlyArray3<'_, u8>> =
         own.as_ref().map(|truth| truth.extract().map_err(|_| unfit("truth", truth, expected))).transpose()?;
     let result = occupancy.view();
-    if let Some(truth) = array.as_ref().filter(|truth| truth.as_array().shape() != result.grid) {
+    if let Some(truth) = array.as_ref().filter(|truth| truth.as_array().shape() != result.grid.size) {
         let found = truth.as_array().shape().to_vec();
-        return Err(Error::mismatch(format!("truth: shape {found:?}, expected {:?}", result.grid)).into());
+        return Err(Error::mismatch(format!("truth: shape {found:?}, expected {:?}", result.grid.size)).into());
     }
     let truth: Option<Vec<u8>> = array.map(|truth| truth.as_array().iter().copied().collect());
     let network = occupancy.model().network();
     let scene = scene.map(|scene| &scene.get().scene);
     let html = py.detach(|| -> voxcast::Result<String> {
-        let grid = Grid::of(network);
+        let grid = result.grid;
         let prediction =
             picture::Occupancy::new("", result.classes, grid, grid.forward())?.with_support(result.support)?;
         let palette = Palette::of(network.classes);

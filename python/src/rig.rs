@@ -1,10 +1,10 @@
 //! The projection matrices.
 
 use crate::arrays::lend;
-use crate::error::Outcome;
+use crate::error::{Outcome, warn};
 use crate::machine;
 use crate::model::Model;
-use crate::scene::matrices;
+use crate::scene::{Scene, matrices};
 use numpy::PyArray1;
 use numpy::ndarray::Ix1;
 use pyo3::prelude::*;
@@ -32,12 +32,17 @@ impl Rig {
         isa: Option<&str>,
     ) -> Outcome<Self> {
         let lidar2img = matrices(calibration)?;
+        let names = match calibration.cast::<Scene>() {
+            Ok(scene) => scene.get().scene.names.clone(),
+            Err(_) => (0..lidar2img.len()).map(|camera| format!("camera {camera}")).collect(),
+        };
         let (threads, isa) = (machine::threads(threads)?, machine::isa(isa)?);
         let network = model.model.network();
         let rig = py.detach(|| {
             let builder = RigBuilder::new(network, lidar2img.len(), isa)?;
             builder.with_threads(threads).build(&lidar2img)
         })?;
+        warn(py, &rig.visibility(network).notes(&names), 1)?;
         Ok(Self { rig: Arc::new(rig) })
     }
 

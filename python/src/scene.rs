@@ -1,7 +1,7 @@
 //! Images and calibration.
 
 use crate::arrays::lend;
-use crate::error::Outcome;
+use crate::error::{Outcome, warn};
 use crate::images::{unfit, with_images};
 use crate::model::Model;
 use numpy::ndarray::Ix3;
@@ -9,6 +9,7 @@ use numpy::{PyArray3, PyReadonlyArray3};
 use pyo3::prelude::*;
 use std::path::PathBuf;
 use voxcast::Error;
+use voxcast::network::Grid;
 use voxcast::scene::Image;
 use voxcast::synth::Synthesiser;
 
@@ -21,8 +22,8 @@ use voxcast::synth::Synthesiser;
 #[pyclass(frozen, module = "voxcast")]
 pub(crate) struct Scene {
     pub(crate) scene: voxcast::Scene,
-    /// Class of every voxel, and how many there are along x, y, z, where it is known.
-    truth: Option<(Vec<u8>, [usize; 3])>,
+    /// Class of every voxel, and where the voxels are, if it is known.
+    truth: Option<(Vec<u8>, Grid)>,
 }
 
 #[pymethods]
@@ -58,7 +59,8 @@ impl Scene {
     /// Reads a directory with calibration.json and its images, or a .safetensors with `images` and `lidar2img`.
     #[staticmethod]
     fn open(py: Python<'_>, path: PathBuf) -> Outcome<Self> {
-        let scene = py.detach(|| voxcast::Scene::open(&path))?;
+        let (scene, notes) = py.detach(|| voxcast::Scene::open_with_notes(&path))?;
+        warn(py, &notes, 1)?;
         Ok(Self { scene, truth: None })
     }
 
@@ -68,7 +70,7 @@ impl Scene {
     fn street(py: Python<'_>, model: &Model, seed: u64) -> Outcome<Self> {
         let network = model.model.network();
         let drawn = py.detach(|| Synthesiser::new(network).map(|synthesiser| synthesiser.frame(seed)))?;
-        Ok(Self { scene: drawn.scene, truth: Some((drawn.labels, network.output_grid())) })
+        Ok(Self { scene: drawn.scene, truth: Some((drawn.labels, Grid::of(network))) })
     }
 
     /// Writes the scene as a directory with calibration.json and a PNG per camera.
@@ -105,7 +107,7 @@ impl Scene {
     pub(crate) fn truth<'py>(slf: &Bound<'py, Self>) -> Outcome<Option<Bound<'py, PyArray3<u8>>>> {
         let Some((classes, grid)) = &slf.get().truth else { return Ok(None) };
         // SAFETY: the class is frozen and nothing in it changes its labels.
-        Ok(Some(unsafe { lend::<_, Ix3>(classes, *grid, slf.as_any()) }?))
+        Ok(Some(unsafe { lend::<_, Ix3>(classes, grid.size, slf.as_any()) }?))
     }
 
     fn __len__(&self) -> usize {

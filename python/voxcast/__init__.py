@@ -9,10 +9,10 @@
 
 Images are uint8 [cameras, height, width, 3], "bgr" or "rgb" as the caller says. A calibration is float32 [cameras, 4, 4] per
 camera, lidar-frame metres (x, y, z, 1) to (u d, v d, d, 1). What goes wrong raises a subclass of `voxcast.Error` with one
-line that says what was found and what was expected.
+line that says what was found and what was expected. What is allowed and not obeyed is a warning, `voxcast.Note`.
 """
 
-from ._errors import BusyError, Error, FileError, FormatError, MismatchError, TooLargeError, UnsupportedError
+from ._errors import BusyError, Error, FileError, FormatError, MismatchError, Note, TooLargeError, UnsupportedError
 from ._evaluate import evaluate
 from ._import import import_checkpoint
 from ._native import (
@@ -42,6 +42,7 @@ __all__ = [
     "Memory",
     "MismatchError",
     "Model",
+    "Note",
     "Occupancy",
     "Page",
     "Report",

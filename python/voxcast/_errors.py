@@ -1,4 +1,4 @@
-"""Exceptions. The text of each is the line that the command line prints."""
+"""Exceptions and warnings. The text of each is the line that the command line prints."""
 
 from __future__ import annotations
 
@@ -35,3 +35,7 @@ class TooLargeError(Error, MemoryError):
 
 class BusyError(Error, RuntimeError):
     """Another thread is using the object."""
+
+
+class Note(UserWarning):
+    """What a file says that is not obeyed, or is hardly ever meant. Not an error; `warnings` decides what becomes of it."""

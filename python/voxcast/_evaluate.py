@@ -18,7 +18,7 @@ def evaluate(
     limit: int | None = None,
     shard: str | None = None,
     resume: str | os.PathLike[str] | None = None,
-    workers: int = 1,
+    workers: int | None = None,
     threads: int | None = None,
     isa: str | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -26,12 +26,13 @@ def evaluate(
     """Scores a model on a data set with labels; two models are scored on the same frames and compared.
 
     data: as on the command line: "synthetic:DIR", "surroundocc:ROOT:LABELS[:SCENES]", "occ3d:ROOT:LABELS[:SCENES]",
-        "semantickitti:ROOT[:SPLIT[:stereo]]".
+        "semantickitti:ROOT[:SPLIT[:stereo]]", "uniocc:ROOT[:IMAGES]" and others (docs/evaluation.md).
     losses: also the four losses of the training. limit: only the first frames. shard: "I/N", see docs/many-machines.md.
     resume: a journal of every frame's score, from which the same call goes on.
-    workers: frames at a time, with `threads` in all. None of it changes a number.
+    workers: frames at a time, with `threads` in all; by default as many as `voxcast eval` takes. None of it changes a number.
     progress: called with the frames done and all that were left; by default a line on a terminal.
 
+    What images say that is not obeyed is a warning, `voxcast.Note`, of the first that says it.
     The interpreter's lock is free meanwhile, and an interrupt ends the evaluation after the frames under way.
     """
     models = [model] if isinstance(model, Model) else list(model)

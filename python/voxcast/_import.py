@@ -20,6 +20,7 @@ def import_checkpoint(
     *,
     precision: Literal["f32", "f16"] = "f32",
     fold: Literal["all", "batch-norm", "none"] = "all",
+    exact: bool = False,
     self_test: bool = True,
     threads: int | None = None,
 ) -> _native.Model:
@@ -30,14 +31,15 @@ def import_checkpoint(
     network: "nuscenes-200", "nuscenes-256", "semantickitti-256", "edge", a network.json; or its keys as a mapping or a
         dataclass, such as `voxcast_train.network.Network`.
     output: the file to write; without one the model stays in memory.
-    precision: how weights are stored. fold: "batch-norm" keeps the pyramid's features, "none" batch norms too.
+    precision: how weights are stored. fold: "batch-norm" keeps the pyramid's features, "none" batch norms and direct sums
+        too. exact: every convolution is a direct sum, none Winograd's minimal filtering.
     self_test: record what the model must give, for `Model.selftest`. Only a file has one.
 
     Raises FormatError or MismatchError naming the tensor that is missing, of another shape, or not finite.
     """
     text = _network(network)
     target = None if output is None else os.fspath(output)
-    wish = (text, target, precision, fold, self_test, threads)
+    wish = (text, target, precision, fold, exact, self_test, threads)
     if isinstance(checkpoint, (str, os.PathLike)):
         return _native.import_file(os.fspath(checkpoint), wish)
     state = checkpoint if isinstance(checkpoint, Mapping) else checkpoint.state_dict()

@@ -33,7 +33,7 @@ __version__: str
 _Path = str | PathLike[str]
 _Isa = Literal["scalar", "avx2", "avx512"]
 _Order = Literal["bgr", "rgb"]
-_Wish = tuple[str, str | None, str, str, bool, int | None]
+_Wish = tuple[str, str | None, str, str, bool, bool, int | None]
 _Images = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 
 @final
@@ -209,7 +209,7 @@ class Evaluation:
     def run(
         self,
         *,
-        workers: int = 1,
+        workers: int | None = None,
         threads: int | None = None,
         isa: str | None = None,
         watch: Callable[[int], object] | None = None,

@@ -45,3 +45,42 @@ impl fmt::Display for Note {
         }
     }
 }
+
+/// What has been said so far: the same holds of most frames of a drive or a data set, and is said of the first.
+#[derive(Clone, Debug, Default)]
+pub struct Said {
+    notes: Vec<Note>,
+}
+
+impl Said {
+    /// Those of `notes` whose message has not been said of any file. They count as said from here on.
+    pub fn fresh(&mut self, notes: Vec<Note>) -> &[Note] {
+        let known = self.notes.len();
+        for note in notes {
+            if self.notes.iter().all(|other| other.message() != note.message()) {
+                self.notes.push(note);
+            }
+        }
+        &self.notes[known..]
+    }
+
+    /// All that has been said, in its order.
+    pub fn notes(&self) -> &[Note] {
+        &self.notes
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_message_is_said_of_the_first_file() {
+        let note = |file: &str, message: &str| Note::new(message).in_file(Path::new(file));
+        let mut said = Said::default();
+        assert_eq!(said.fresh(vec![note("a", "x"), note("a", "x"), note("b", "y")]), [note("a", "x"), note("b", "y")]);
+        assert_eq!(said.fresh(vec![note("c", "y"), Note::new("z")]), [Note::new("z")]);
+        assert!(said.fresh(vec![]).is_empty());
+        assert_eq!(said.notes(), [note("a", "x"), note("b", "y"), Note::new("z")]);
+    }
+}

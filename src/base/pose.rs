@@ -33,6 +33,13 @@ impl Pose {
         Ok(Self { rotation: DMat3::from_quat(quaternion / length), shift: shift.into() })
     }
 
+    /// The pose of a row-major 4x4 that is a rotation and a shift.
+    #[cfg(feature = "eval")]
+    pub(crate) fn from_rigid(m: &[[f64; 4]; 4]) -> Self {
+        let rotation = DMat3::from_cols_array_2d(&[m[0], m[1], m[2]].map(|[x, y, z, _]| [x, y, z])).transpose();
+        Self { rotation, shift: DVec3::new(m[0][3], m[1][3], m[2][3]) }
+    }
+
     /// The outer frame's place of a point of the inner one.
     pub fn apply(&self, point: [f64; 3]) -> [f64; 3] {
         (self.rotation * DVec3::from(point) + self.shift).into()

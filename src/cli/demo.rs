@@ -48,7 +48,7 @@ pub struct Demo {
     #[arg(long, default_value = "f16", value_parser = ["f32", "f16", "int8", "i8"], hide_possible_values = true,
         value_name = "f32|f16|int8")]
     precision: String,
-    /// Which street is drawn; the network was trained on 0 to 2419
+    /// Which street is drawn; the network was trained on 0 to 5434
     #[arg(long, default_value_t = 1_000_006)]
     seed: u64,
     #[command(flatten)]
@@ -67,8 +67,7 @@ impl Demo {
         let network = model.network();
         let start = Instant::now();
         let drawn = Synthesiser::new(network)?.frame(self.seed);
-        let grid = network.output_grid();
-        drawn.save_scene(&directory.join("scene"), grid)?;
+        drawn.save_scene(&directory.join("scene"), Grid::of(network))?;
         println!("street of seed {} drawn in {}", self.seed, terminal::time(start.elapsed()));
 
         let start = Instant::now();
@@ -146,12 +145,14 @@ fn score(drawn: &Frame, result: &Occupancy<'_>) -> String {
 /// The picture: images, prediction and truth.
 fn draw(path: &Path, network: &Network, drawn: &Frame, result: &Occupancy<'_>, score: &str) -> Result<()> {
     let palette = Palette::of(network.classes);
-    let grid = Grid::of(network);
+    let grid = result.grid;
     let occupancy = |caption, classes| picture::Occupancy::new(caption, classes, grid, grid.forward());
     let occupancies =
         [occupancy("prediction", result.classes)?.with_support(result.support)?, occupancy("truth", &drawn.labels)?];
     let images: Vec<_> = drawn.scene.names.iter().map(String::as_str).zip(&drawn.scene.images).collect();
-    let subtitle = format!("six cameras of 128 x 352 pixels, a street that the network was not trained on: {score}");
+    let [height, width] = network.image;
+    let subtitle =
+        format!("six cameras of {height} x {width} pixels, a street that the network was not trained on: {score}");
     let figure = Figure {
         title: "voxcast demo",
         subtitle: &subtitle,

@@ -6,6 +6,7 @@ use std::ops::Range;
 use std::path::Path;
 use voxcast::container::{self, Data, Layout};
 use voxcast::graph::{Element, Elements, Graph, Results, Rewrites, Section, Space, Tensor};
+use voxcast::network::Grid;
 use voxcast::session::Event;
 use voxcast::{Error, ErrorKind, Network, Result, Rig};
 
@@ -104,7 +105,7 @@ impl Dump {
     }
 
     /// Adds matrices and classes and writes all of it to `directory/stages.safetensors`.
-    pub fn finish(mut self, directory: &Path, rig: &Rig, grid: [usize; 3], classes: &[u8]) -> Result<()> {
+    pub fn finish(mut self, directory: &Path, rig: &Rig, grid: Grid, classes: &[u8]) -> Result<()> {
         for level in 0..3 {
             let matrices = rig.level(level);
             let parts = [matrices.volume.ptr, matrices.volume.col, matrices.bev.ptr, matrices.bev.col];
@@ -116,7 +117,7 @@ impl Dump {
             }
         }
         if self.wants("classes") {
-            let stage = Stage { dtype: Dtype::U8, shape: grid.to_vec(), bytes: classes.to_vec() };
+            let stage = Stage { dtype: Dtype::U8, shape: grid.size.to_vec(), bytes: classes.to_vec() };
             self.stages.insert("classes".to_owned(), stage);
         }
         std::fs::create_dir_all(directory).map_err(|e| Error::io(directory, "create", &e))?;

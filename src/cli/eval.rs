@@ -3,10 +3,12 @@
 use super::shard::ShardArgument;
 use super::{Machine, frame, terminal};
 use clap::Args;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use voxcast::dataset::{DataSet, FORMS, Named};
-use voxcast::eval::{Evaluation, Means, Predictor, Says, Scope, Shard, Summary, majority, write_text};
+use voxcast::eval::{
+    ABOUT, Evaluation, Means, Predictor, Says, Scope, Shard, Summary, majority, write_submission, write_text,
+};
 use voxcast::{Error, Model, Result};
 
 /// Score a model on a data set with labels: IoU, mIoU and every class, near and far, seen and unseen.
@@ -23,6 +25,7 @@ Examples:
   voxcast eval --majority synthetic:train --data synthetic:heldout    # what can be said without looking
   voxcast eval --model model.safetensors --data surroundocc:nuscenes:nuscenes_occ:val
   voxcast eval --model model.safetensors --data semantickitti:kitti:08
+  voxcast eval --model model.safetensors --data openocc:nuscenes/v1.0-test:none --submission submission.gz
 
 Many machines, here the third of eight; then, once all have ended, the numbers of one run:
   voxcast eval --model model.safetensors --data synthetic:heldout --shard 2/8 --resume shard-2.jsonl
@@ -47,7 +50,8 @@ pub struct Eval {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     limit: Option<u32>,
     /// Frames that are computed at the same time, each with its own session. It does not change a result
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    #[arg(long, value_name = "N", default_value_t = Means::WORKERS as u16,
+        value_parser = clap::value_parser!(u16).range(1..=256))]
     workers: u16,
     /// Also compute the four losses of the training, of level 0
     #[arg(long, conflicts_with = "majority")]
@@ -64,6 +68,15 @@ pub struct Eval {
     #[arg(long, value_name = "JOURNAL", num_args = 1..,
         conflicts_with_all = ["model", "compare", "majority", "data", "losses", "resume", "shard"])]
     merge: Vec<PathBuf>,
+    /// Instead of scoring, write what OpenOcc v2's challenge takes, gzip of a pickle: class and distance along its rays. For
+    /// openocc sets; LABELS is not read, and may be any word where there are none
+    #[arg(long, value_name = "FILE.gz", conflicts_with_all = ["compare", "merge", "losses", "resume", "shard",
+        "confusion", "json", "markdown"])]
+    submission: Option<PathBuf>,
+    /// What the submission says of itself: method, team, authors, e-mail, "institution / company" or "country / region".
+    /// May be given again
+    #[arg(long, value_name = "KEY=VALUE", requires = "submission", value_parser = about)]
+    about: Vec<(String, String)>,
     /// Draw the confusion matrix; with --compare, of A's classes with B's
     #[arg(long, value_name = "FILE.png")]
     confusion: Option<PathBuf>,
@@ -77,18 +90,44 @@ pub struct Eval {
     machine: Machine,
 }
 
+/// `KEY=VALUE`.
+fn about(text: &str) -> std::result::Result<(String, String), String> {
+    let (key, value) = text.split_once('=').ok_or("expected KEY=VALUE")?;
+    match ABOUT.contains(&key) {
+        true => Ok((key.to_owned(), value.to_owned())),
+        false => Err(format!("expected one of {}", ABOUT.join(", "))),
+    }
+}
+
 impl Eval {
     pub fn run(self) -> Result<()> {
-        for path in [&self.json, &self.markdown, &self.confusion, &self.resume].into_iter().flatten() {
+        for path in [&self.json, &self.markdown, &self.confusion, &self.resume, &self.submission].into_iter().flatten()
+        {
             frame::check_output(path)?;
         }
         self.check_apart()?;
         let limit = self.limit.map(|limit| limit as usize);
-        match &self.data {
-            Some(data) => self.report(&self.score(data, limit)?),
+        match (&self.data, &self.submission) {
+            (Some(data), Some(submission)) => self.submit(submission, data, limit),
+            (Some(data), None) => self.report(&self.score(data, limit)?),
             // clap has seen to it that there are journals.
-            None => self.report(&Summary::merge(&self.merge, limit)?),
+            (None, _) => self.report(&Summary::merge(&self.merge, limit)?),
         }
+    }
+
+    fn submit(&self, path: &Path, data: &Named, limit: Option<usize>) -> Result<()> {
+        let set = data.open_openocc()?;
+        let options = frame::options(&self.machine)?;
+        let bar = terminal::progress("predicting", limit.map_or(set.len(), |limit| set.len().min(limit)));
+        for predictor in self.predictors(&set, data)? {
+            write_submission(path, &set, &predictor, &self.about, limit, &options, &mut |done, notes| {
+                bar.suspend(|| terminal::say(notes));
+                bar.set_position(done as u64);
+                Ok(())
+            })?;
+        }
+        bar.finish_and_clear();
+        Ok(())
     }
 
     fn score(&self, data: &Named, limit: Option<usize>) -> Result<Summary> {
@@ -108,7 +147,8 @@ impl Eval {
             isa: self.machine.isa()?,
         };
         let bar = terminal::progress("scoring", evaluation.left(&totals).len());
-        evaluation.run(&means, &mut totals, journal.as_mut(), &mut |done| {
+        evaluation.run(&means, &mut totals, journal.as_mut(), &mut |done, notes| {
+            bar.suspend(|| terminal::say(notes));
             bar.set_position(done as u64);
             Ok(())
         })?;

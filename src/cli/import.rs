@@ -1,7 +1,8 @@
 //! `voxcast import`
 
 use super::{ThreadCount, calibrate, terminal};
-use clap::Args;
+use clap::{Args, CommandFactory};
+use indicatif::ProgressBar;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use voxcast::calibrate::Mixed;
@@ -11,18 +12,19 @@ use voxcast::graph::Rewrites;
 use voxcast::import::{Integers, Source};
 use voxcast::model::ranges::Ranges;
 use voxcast::model::unpacked::Unpacked;
-use voxcast::model::{FORMAT, Model, Options};
+use voxcast::model::{FORMAT, Model, Options, use_winograd};
 use voxcast::network::BUILT_IN;
 use voxcast::weights::Precision;
 use voxcast::{Error, ErrorKind, Isa, Network, Note, Result};
 
 /// Turn a training checkpoint into a model: batch norms and the projection folded in f64, weights packed as the kernels
-/// read them.
+/// read them. Or a model with direct sums into one that uses Winograd's minimal filtering.
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Examples:
   voxcast import epoch_24.pth --network nuscenes-200 -o model.safetensors
   voxcast import weights.safetensors --network network.json --precision f16 -o model.safetensors
+  voxcast import epoch_24.pth --network nuscenes-200 --exact -o model.safetensors    (every convolution a direct sum)
   voxcast import epoch_24.pth --network nuscenes-200 --precision int8 --calibrate scenes/* -o int8.safetensors
   voxcast import model.safetensors --precision int8 --calibrate synthetic:train -o int8.safetensors
   voxcast import model.safetensors --precision int8 --calibrate synthetic:train --auto-mixed 30 -o int8.safetensors
@@ -36,15 +38,14 @@ tensors the network does not have.
 int8 needs the range of every tensor: measured here (--calibrate), or by voxcast calibrate (--ranges). docs/int8.md says which
 operations stay in f32 and how to find the ones that lose most.")]
 pub struct Import {
-    /// mmengine .pth, .safetensors with the same names, or a model of f32 or f16
+    /// mmengine .pth, .safetensors with the same names, or a model of f32 or f16 that uses direct sums
     checkpoint: PathBuf,
     /// nuscenes-200, nuscenes-256, semantickitti-256, edge, or a network.json [default: that of a model]
     #[arg(long, value_name = "NAME|FILE.json")]
     network: Option<String>,
-    /// How weights are stored; arithmetic is in integers for int8, else f32
-    #[arg(long, default_value = "f32", value_parser = ["f32", "f16", "int8", "i8"], hide_possible_values = true,
-        value_name = "f32|f16|int8")]
-    precision: String,
+    /// How weights are stored; arithmetic is in integers for int8, else f32 [default: f32, or that of a model]
+    #[arg(long, value_parser = ["f32", "f16", "int8", "i8"], hide_possible_values = true, value_name = "f32|f16|int8")]
+    precision: Option<String>,
     /// Scenes and data sets to measure ranges on, for int8: directories, .safetensors files, synthetic:DIR and others
     #[arg(long, value_name = "SCENE", num_args = 1.., conflicts_with = "ranges")]
     calibrate: Vec<String>,
@@ -62,9 +63,14 @@ pub struct Import {
     /// decibels, measured on two of the frames of --calibrate
     #[arg(long, value_name = "DB", requires = "calibrate")]
     auto_mixed: Option<f64>,
-    /// Rewrites applied to the network: all, batch-norm (keeps the pyramid's features), none (keeps batch norms too)
+    /// Rewrites applied to the network: all, batch-norm (keeps the pyramid's features), none (keeps batch norms
+    /// and direct sums too)
     #[arg(long, default_value = "all", value_parser = ["all", "batch-norm", "none"])]
     fold: String,
+    /// Compute every convolution as a direct sum, none by Winograd's minimal filtering: slower, and a rounding error about
+    /// half as large. int8 is exact either way
+    #[arg(long)]
+    exact: bool,
     /// The model to write
     #[arg(short, long, value_name = "MODEL")]
     output: PathBuf,
@@ -80,24 +86,31 @@ const MIXED_FRAMES: usize = 2;
 
 impl Import {
     pub fn run(self) -> Result<()> {
-        let precision = Precision::parse(&self.precision).unwrap_or(Precision::F32);
-        self.check_usage(precision);
+        let given = self.precision.as_deref().and_then(Precision::parse);
         match self.model()? {
             Some(model) => {
+                let precision = given.unwrap_or(model.options().precision);
+                self.check_usage(precision);
                 let network = self.network.as_deref().map(read_network).transpose()?;
                 if network.is_some_and(|network| network != *model.network()) {
                     return Err(Error::mismatch("--network is not the model's").in_file(&self.checkpoint));
+                }
+                if precision == model.options().precision && self.fold == "all" && !self.exact {
+                    let bar = terminal::progress("transforming", 0);
+                    use_winograd(&model, &self.output, &mut steps(&bar)).map_err(|e| e.in_file(&self.checkpoint))?;
+                    return self.finish(&bar, &[]);
                 }
                 let source = Unpacked::new(&model).map_err(|e| e.in_file(&self.checkpoint))?;
                 self.convert(&source, model.network(), precision, vec![])
             }
             None => {
+                let precision = given.unwrap_or(Precision::F32);
+                self.check_usage(precision);
                 let Some(network) = &self.network else { return usage("--network, unless the checkpoint is a model") };
                 let network = read_network(network)?;
                 let checkpoint = Checkpoint::open(&self.checkpoint)?;
                 self.convert(&checkpoint, &network, precision, checkpoint.notes())?;
-                let unused = unused(&checkpoint).map(|note| note.in_file(&self.checkpoint));
-                terminal::say(&Vec::from_iter(unused));
+                terminal::say(&Vec::from_iter(checkpoint.unused_note()));
                 Ok(())
             }
         }
@@ -123,21 +136,19 @@ impl Import {
     }
 
     fn rewrites(&self) -> Rewrites {
-        match self.fold.as_str() {
+        let rewrites = match self.fold.as_str() {
             "all" => Rewrites::ALL,
             "none" => Rewrites::NONE,
             _ => Rewrites { projection: false, ..Rewrites::ALL },
-        }
+        };
+        Rewrites { winograd: rewrites.winograd && !self.exact, ..rewrites }
     }
 
     fn convert(&self, source: &dyn Source, network: &Network, precision: Precision, notes: Vec<Note>) -> Result<()> {
         let in_checkpoint = |e: Error| e.in_file(&self.checkpoint);
         let rewrites = self.rewrites();
         let bar = terminal::progress("importing", 0);
-        let progress = &mut |done, total| {
-            bar.set_length(total as u64);
-            bar.set_position(done as u64);
-        };
+        let progress = &mut steps(&bar);
         let ranges = match precision {
             Precision::I8 => Some(self.ranges(source, network, rewrites)?),
             Precision::F32 | Precision::F16 => None,
@@ -157,6 +168,11 @@ impl Import {
             }
         }
         .map_err(in_checkpoint)?;
+        self.finish(&bar, &notes)
+    }
+
+    /// Adds the self-test, and says what was written.
+    fn finish(&self, bar: &ProgressBar, notes: &[Note]) -> Result<()> {
         if !self.no_self_test {
             bar.set_message("self-test");
             let hint = |e: Error| {
@@ -167,12 +183,12 @@ impl Import {
             voxcast::selftest::record(&self.output, Isa::best(), &self.threads.threads()?).map_err(hint)?;
         }
         bar.finish_and_clear();
-        terminal::say(&notes);
+        terminal::say(notes);
         let model = Model::open(&self.output)?;
         println!(
             "{}: {} weights, {}, checksum {:016x}",
             self.output.display(),
-            precision.name(),
+            model.options().precision.name(),
             terminal::bytes(model.file_size()),
             model.checksum().unwrap_or_default()
         );
@@ -205,34 +221,25 @@ impl Import {
         }
         let bar = terminal::progress("folding", 0);
         let options = Options { precision: Precision::F32, rewrites };
-        let bytes = voxcast::import::import_to_bytes(source, network, options, &mut |done, total| {
-            bar.set_length(total as u64);
-            bar.set_position(done as u64);
-        });
+        let bytes = voxcast::import::import_to_bytes(source, network, options, &mut steps(&bar));
         bar.finish_and_clear();
         let model = Arc::new(Model::from_bytes(bytes.map_err(|e| e.in_file(&self.checkpoint))?)?);
         calibrate::measure(&model, &self.calibrate, self.calibrate_frames, (Isa::best(), self.threads.threads()?))
     }
 }
 
-/// Ends the program as clap does where it finds arguments wrong.
-fn usage(expected: &str) -> Result<()> {
-    use clap::CommandFactory;
-    let message = format!("expected {expected}");
-    super::Arguments::command().error(clap::error::ErrorKind::ArgumentConflict, message).exit()
+/// How many of how many steps are done, on `bar`.
+fn steps(bar: &ProgressBar) -> impl FnMut(usize, usize) + '_ {
+    |done, total| {
+        bar.set_length(total as u64);
+        bar.set_position(done as u64);
+    }
 }
 
-/// Ends of names that training keeps for itself: counters of batch norms and of moving averages.
-const COUNTERS: [&str; 3] = ["num_batches_tracked", "steps", "n_averaged"];
-
-/// What the checkpoint has and the network does not: it would change the result if it belonged to it.
-fn unused(checkpoint: &Checkpoint) -> Option<Note> {
-    let is_counter = |name: &str| COUNTERS.contains(&name.rsplit('.').next().unwrap_or(name));
-    let unused: Vec<&str> = checkpoint.unused().filter(|name| !is_counter(name)).collect();
-    let shown: Vec<String> = unused.iter().take(3).map(|name| format!("{name:?}")).collect();
-    let more = if unused.len() > 3 { ", ..." } else { "" };
-    let message = format!("{} tensors that the network does not have: {}{more}", unused.len(), shown.join(", "));
-    (!unused.is_empty()).then(|| Note::new(message))
+/// Ends the program as clap does where it finds arguments wrong.
+fn usage(expected: &str) -> Result<()> {
+    let message = format!("expected {expected}");
+    super::Arguments::command().error(clap::error::ErrorKind::ArgumentConflict, message).exit()
 }
 
 /// A built-in network by name, or one from a JSON file.

@@ -53,12 +53,14 @@ impl Inspect {
         let graph = model.graph(false, Results::default());
         let memory = Session::memory(&model, cameras, &options).map_err(|e| e.in_file(&self.file))?;
         let parameters: usize = model.tensors().map(|(_, _, len)| len).sum();
-        let multiply_adds: u64 = (0..graph.operations.len())
-            .map(|i| {
+        let work = |count: fn(&Graph, &Operation) -> u64| {
+            let of = |i: usize| {
                 let times = if i < graph.camera_operations { cameras as u64 } else { 1 };
-                graph.multiply_adds(&graph.operations[i]).saturating_mul(times)
-            })
-            .fold(0, u64::saturating_add);
+                count(&graph, &graph.operations[i]).saturating_mul(times)
+            };
+            (0..graph.operations.len()).map(of).fold(0, u64::saturating_add)
+        };
+        let (multiply_adds, executed) = (work(Graph::multiply_adds), work(Graph::executed_multiply_adds));
         let rewrites = model.options().rewrites;
         let kept = kept(&model, &graph);
         let operations: Vec<Row<'_>> =
@@ -71,6 +73,7 @@ impl Inspect {
                 "kept_f32": kept,
                 "batch_norm_folded": rewrites.batch_norm,
                 "projection_folded": rewrites.projection,
+                "winograd_used": rewrites.winograd,
                 "stored_numbers": parameters,
                 "file_bytes": model.file_size(),
                 "checksum": model.checksum().map(|c| format!("{c:016x}")),
@@ -80,6 +83,7 @@ impl Inspect {
                 "output_bytes": memory.output,
                 "session_bytes": memory.total(),
                 "multiply_adds": multiply_adds,
+                "executed_multiply_adds": executed,
                 "operations": operations.iter().enumerate().map(|(i, row)| serde_json::json!({
                     "name": row.operation.name,
                     "kind": row.operation.op.description().kind(),
@@ -90,6 +94,7 @@ impl Inspect {
                     "output_bytes": row.tensor.bytes(),
                     "weight_bytes": row.weight_bytes,
                     "multiply_adds": graph.multiply_adds(row.operation),
+                    "executed_multiply_adds": graph.executed_multiply_adds(row.operation),
                 })).collect::<Vec<_>>(),
             });
             println!("{value:#}");
@@ -99,11 +104,12 @@ impl Inspect {
         println!("model      {}", self.file.display());
         println!("checksum   {:016x}", model.checksum().unwrap_or_default());
         println!(
-            "weights    {} numbers, {} (batch norms {}, projection {})",
+            "weights    {} numbers, {} (batch norms {}, projection {}, {})",
             parameters,
             model.options().precision.name(),
             if rewrites.batch_norm { "folded" } else { "kept" },
-            if rewrites.projection { "folded" } else { "kept" }
+            if rewrites.projection { "folded" } else { "kept" },
+            if rewrites.winograd { "Winograd where it pays" } else { "direct sums" }
         );
         if let Some(quantisation) = model.quantisation() {
             let asked = match quantisation.keep_f32.is_empty() {
@@ -119,7 +125,11 @@ impl Inspect {
         println!("file       {}", terminal::bytes(model.file_size()));
         println!("images     {} x {} (height x width, padded)", network.image[0], network.image[1]);
         println!("output     {x} x {y} x {z} voxels, {} classes", network.classes);
-        println!("work       {:.1} GMAC a frame of {cameras} cameras", multiply_adds as f64 / 1e9);
+        println!(
+            "work       {:.1} GMAC a frame of {cameras} cameras, of which {:.1} are executed",
+            multiply_adds as f64 / 1e9,
+            executed as f64 / 1e9
+        );
         println!(
             "session    {} bytes for {cameras} cameras and {} threads: arena {}, output {}",
             memory.total(),
@@ -131,7 +141,7 @@ impl Inspect {
         if self.operations {
             for (i, row) in operations.iter().enumerate() {
                 println!(
-                    "{:>4} {:60} {:18} {:>8} {:>3} {:?} x {:<5} {:>9} weights {:>9} {:>8.3} GMAC{}",
+                    "{:>4} {:60} {:18} {:>8} {:>3} {:?} x {:<5} {:>9} weights {:>9} {:>8.3} GMAC {:>8.3} executed{}",
                     i,
                     row.operation.name,
                     row.operation.op.description().kind(),
@@ -142,6 +152,7 @@ impl Inspect {
                     terminal::bytes(row.tensor.bytes()),
                     terminal::bytes(row.weight_bytes),
                     graph.multiply_adds(row.operation) as f64 / 1e9,
+                    graph.executed_multiply_adds(row.operation) as f64 / 1e9,
                     if i < graph.camera_operations { " per camera" } else { "" }
                 );
             }

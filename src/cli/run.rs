@@ -9,7 +9,6 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use voxcast::html::Page;
-use voxcast::network::Grid;
 use voxcast::npz::{Array, Elements, write_npz};
 use voxcast::picture::{self, Figure, Palette};
 use voxcast::session::{Occupancy, views};
@@ -211,7 +210,7 @@ pub fn title(model: &Path) -> String {
 
 /// Writes the result as a `.npz`.
 pub fn write(path: &Path, network: &Network, result: &Occupancy<'_>, logits: bool) -> Result<()> {
-    let [x, y, z] = result.grid;
+    let [x, y, z] = result.grid.size;
     let shape = [x, y, z, network.classes];
     let colours: Vec<u8> = Palette::of(network.classes).classes().iter().flat_map(|c| c.rgb).collect();
     let table = [network.classes, 3];
@@ -221,7 +220,7 @@ pub fn write(path: &Path, network: &Network, result: &Occupancy<'_>, logits: boo
         arrays.push(Array { name: "logits", shape: &shape, elements: Elements::F32(values) });
     }
     arrays.push(Array { name: "support", shape: &shape[..3], elements: Elements::U16(result.support) });
-    arrays.push(Array { name: "bounds", shape: &[3, 2], elements: Elements::F32(network.bounds.as_flattened()) });
+    arrays.push(Array { name: "bounds", shape: &[3, 2], elements: Elements::F32(result.grid.bounds.as_flattened()) });
     arrays.push(colours);
     write_npz(path, &arrays)
 }
@@ -236,7 +235,7 @@ pub fn write_page(
     [title, subtitle]: [&str; 2],
 ) -> Result<()> {
     let palette = Palette::of(network.classes);
-    let prediction = picture::Occupancy::new("", result.classes, Grid::of(network), Grid::of(network).forward())?
+    let prediction = picture::Occupancy::new("", result.classes, result.grid, result.grid.forward())?
         .with_support(result.support)?;
     Page { title, subtitle, prediction, truth, scene, palette: &palette }.write(path)
 }
@@ -250,7 +249,7 @@ pub fn draw(
     subtitle: &str,
 ) -> Result<picture::Picture> {
     let palette = Palette::of(network.classes);
-    let occupancy = picture::Occupancy::new("", result.classes, Grid::of(network), Grid::of(network).forward())?
+    let occupancy = picture::Occupancy::new("", result.classes, result.grid, result.grid.forward())?
         .with_support(result.support)?;
     let images: Vec<_> = scene.names.iter().map(String::as_str).zip(&scene.images).collect();
     Ok(picture::draw(&Figure { title, subtitle, images: &images, occupancies: &[occupancy], palette: &palette }))
@@ -272,7 +271,7 @@ impl Summary {
         let logits = result.logits_digest().map(|d| format!("{d:016x}"));
         if json {
             let value = serde_json::json!({
-                "grid": result.grid,
+                "grid": result.grid.size,
                 "counts": counts,
                 "digest": digest,
                 "logits_digest": logits,
@@ -287,7 +286,7 @@ impl Summary {
             println!("{value}");
             return;
         }
-        let [x, y, z] = result.grid;
+        let [x, y, z] = result.grid.size;
         let occupied = result.classes.len() - counts[0];
         println!(
             "{x}x{y}x{z} voxels, {occupied} occupied ({}), digest {digest}",

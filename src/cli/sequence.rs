@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 use voxcast::log::Summary;
+use voxcast::note::Said;
 use voxcast::picture::Animation;
 use voxcast::session::Moving;
 use voxcast::{Error, Model, Note, Result, Scene, SessionOptions};
@@ -103,12 +104,12 @@ impl Run {
             let notes = std::mem::take(&mut frame.notes);
             let (scene, path) = (&frame.scene, frame.path.clone());
             let read = start.elapsed();
-            bar.suspend(|| said.say(notes));
+            bar.suspend(|| terminal::say(said.fresh(notes)));
             let driver = match &mut driver {
                 Some(driver) => driver,
                 none => {
                     let driver = none.insert(Driver::new(self, &model, scene, &options)?);
-                    bar.suspend(|| said.say(std::mem::take(&mut driver.notes)));
+                    bar.suspend(|| terminal::say(said.fresh(std::mem::take(&mut driver.notes))));
                     driver
                 }
             };
@@ -142,7 +143,7 @@ impl Run {
             animation.finish()?;
         }
         let rigs = driver.map_or((0, Duration::ZERO), |driver| (driver.moving.rigs, driver.moving.rig_time));
-        self.print_sequence(&done, frames.summary(), rigs, &said.notes);
+        self.print_sequence(&done, frames.summary(), rigs, said.notes());
         Ok(())
     }
 
@@ -217,25 +218,6 @@ impl Run {
         println!("frame {latency}");
         println!("reading a {} {read}", if log.is_some() { "frame" } else { "scene" });
         println!("rigs: {rigs}, in {}", terminal::time(rig_time));
-    }
-}
-
-/// What has been said of the scenes so far.
-#[derive(Default)]
-struct Said {
-    notes: Vec<Note>,
-}
-
-impl Said {
-    /// Says what has not been said of a scene before: the same holds of most scenes of a drive.
-    fn say(&mut self, notes: Vec<Note>) {
-        let known = self.notes.len();
-        for note in notes {
-            if self.notes.iter().all(|other| other.message() != note.message()) {
-                self.notes.push(note);
-            }
-        }
-        terminal::say(&self.notes[known..]);
     }
 }
 

@@ -6,6 +6,7 @@ use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
+use voxcast::network::Grid;
 use voxcast::synth::{Synthesiser, set_file};
 use voxcast::{Error, Result};
 
@@ -62,7 +63,7 @@ impl Synth {
             return self.write_set(&synthesiser, directory, workers);
         }
         let output = self.output.as_deref().unwrap_or(Path::new("."));
-        let grid = synthesiser.network().output_grid();
+        let grid = Grid::of(synthesiser.network());
         let Some(frames) = self.frames.map(|n| n as usize) else {
             synthesiser.frame(self.seed).save_scene(output, grid)?;
             println!("scene of seed {} in {}", self.seed, output.display());
@@ -78,7 +79,7 @@ impl Synth {
 
     fn write_set(&self, synthesiser: &Synthesiser, directory: &Path, workers: usize) -> Result<()> {
         synthesiser.begin_set(directory)?;
-        let grid = synthesiser.network().output_grid();
+        let grid = Grid::of(synthesiser.network());
         let last = self.seed.checked_add(self.count).filter(|&end| end <= 1_000_000_000);
         if last.is_none() {
             return Err(Error::mismatch(format!("seeds from {} on, expected seeds below 1000000000", self.seed)));

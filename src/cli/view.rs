@@ -52,7 +52,7 @@ impl View {
             terminal::say(&notes);
             scene
         });
-        let truth = self.truth.as_deref().map(|path| read_labels(path, stored.grid)).transpose()?;
+        let truth = self.truth.as_deref().map(|path| read_labels(path, stored.grid.size)).transpose()?;
         let occupancy = stored.occupancy().map_err(|e| e.in_file(&self.result))?;
         let page = Page {
             title: &name_of(&self.result),
@@ -78,8 +78,7 @@ pub fn name_of(path: &Path) -> String {
 struct Stored {
     classes: Vec<u8>,
     support: Vec<u16>,
-    grid: [usize; 3],
-    bounds: [[f32; 2]; 3],
+    grid: Grid,
     palette: Palette,
 }
 
@@ -87,7 +86,7 @@ impl Stored {
     fn read(path: &Path, network: Option<&Network>) -> Result<Self> {
         let arrays = read_npz(path)?;
         let find = |name: &str| arrays.iter().find(|a| a.name == name);
-        let (grid, classes) = match find("classes") {
+        let (size, classes) = match find("classes") {
             Some(OwnedArray { shape, elements: OwnedElements::U8(classes), .. }) if shape.len() == 3 => {
                 ([shape[0], shape[1], shape[2]], classes.clone())
             }
@@ -95,12 +94,12 @@ impl Stored {
             None => return Err(Error::format("no array \"classes\", expected u8 [X, Y, Z]")),
         };
         let support = match find("support") {
-            Some(OwnedArray { shape, elements: OwnedElements::U16(support), .. }) if *shape == grid => support.clone(),
-            Some(other) => return Err(unfit(other, &format!("u16 {grid:?}"))),
+            Some(OwnedArray { shape, elements: OwnedElements::U16(support), .. }) if *shape == size => support.clone(),
+            Some(other) => return Err(unfit(other, &format!("u16 {size:?}"))),
             None => Vec::new(),
         };
-        if let Some(network) = network.filter(|network| network.output_grid() != grid) {
-            let message = format!("a grid of {grid:?}, that of --network has {:?}", network.output_grid());
+        if let Some(network) = network.filter(|network| network.output_grid() != size) {
+            let message = format!("a grid of {size:?}, that of --network has {:?}", network.output_grid());
             return Err(Error::mismatch(message));
         }
         let bounds = match (find("bounds"), network) {
@@ -136,12 +135,11 @@ impl Stored {
             );
             return Err(Error::mismatch(message));
         }
-        Ok(Self { classes, support, grid, bounds, palette })
+        Ok(Self { classes, support, grid: Grid::new(size, bounds), palette })
     }
 
     fn occupancy(&self) -> Result<Occupancy<'_>> {
-        let grid = Grid::new(self.grid, self.bounds);
-        let occupancy = Occupancy::new("", &self.classes, grid, grid.forward())?;
+        let occupancy = Occupancy::new("", &self.classes, self.grid, self.grid.forward())?;
         if self.support.is_empty() { Ok(occupancy) } else { occupancy.with_support(&self.support) }
     }
 }

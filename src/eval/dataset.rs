@@ -4,6 +4,7 @@
 //! frames but the index. Labels are classes of the network's training, [`IGNORED`] where there is no truth.
 
 mod arrays;
+mod kitti;
 mod named;
 pub mod nuscenes;
 pub mod occ3d_waymo;
@@ -11,6 +12,7 @@ mod published;
 pub mod semantickitti;
 pub mod sscbench;
 mod synthetic;
+pub mod uniocc;
 
 pub use crate::base::pose::Pose;
 pub use named::{FORMS, Named};
@@ -20,10 +22,12 @@ pub use published::Published;
 pub use semantickitti::SemanticKitti;
 pub use sscbench::SscBench;
 pub use synthetic::Synthetic;
+pub use uniocc::UniOcc;
 
 pub use crate::network::{Axes, Grid};
 
 use crate::base::error::{Error, Result};
+use crate::base::note::Note;
 use crate::scene::Scene;
 use std::path::{Component, Path};
 
@@ -51,6 +55,13 @@ pub struct Truth {
     pub grid_to_lidar: Pose,
 }
 
+impl Truth {
+    /// Labels without masks in the lidar's frame: the lidar is where its metres begin.
+    fn of_lidar(labels: Vec<u8>) -> Self {
+        Self { labels, masks: vec![], origins: vec![[0.0; 3]], grid_to_lidar: Pose::IDENTITY }
+    }
+}
+
 /// A frame: what a network gets, and what it should say.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
@@ -58,6 +69,8 @@ pub struct Frame {
     pub scene: Scene,
     /// The labels.
     pub truth: Truth,
+    /// What is to be said of the images ([`DataSet::scene`]).
+    pub notes: Vec<Note>,
 }
 
 /// Frames with labels.
@@ -69,7 +82,9 @@ pub trait DataSet: Send + Sync {
     fn grid(&self) -> Grid;
 
     /// Names of the masks that every frame has: parts of the grid to be scored by themselves.
-    fn masks(&self) -> &[&'static str];
+    fn masks(&self) -> &[&'static str] {
+        &[]
+    }
 
     /// How the set's own evaluation counts, where that differs.
     fn published(&self) -> Option<Published> {
@@ -97,7 +112,20 @@ pub trait DataSet: Send + Sync {
     ///
     /// # Panics
     /// If there is no such frame.
-    fn frame(&self, index: usize) -> Result<Frame>;
+    fn frame(&self, index: usize) -> Result<Frame> {
+        let (scene, notes) = self.scene(index)?;
+        Ok(Frame { scene, truth: self.truth(index)?, notes })
+    }
+
+    /// Reads images and calibration of frame `index` alone, and notes what in them is not obeyed or hardly ever meant, as
+    /// [`Scene::open_with_notes`] does.
+    ///
+    /// # Errors
+    /// As [`DataSet::frame`].
+    ///
+    /// # Panics
+    /// If there is no such frame.
+    fn scene(&self, index: usize) -> Result<(Scene, Vec<Note>)>;
 
     /// Reads the labels of frame `index` alone.
     ///

@@ -7,9 +7,11 @@ use super::summary::Summary;
 use super::{Confusion, FrameScore, Options, Prediction, Scorer, Totals};
 use crate::base::digest;
 use crate::base::error::{Error, Result};
+use crate::base::note::{Note, Said};
 use crate::base::threads::Threads;
 use crate::model::Model;
 use crate::runtime::session::{Moving, Occupancy, SessionOptions};
+use crate::scene::Scene;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -45,6 +47,14 @@ impl Predictor {
         Self { name, says: Says::Model(model) }
     }
 
+    /// The voxels that it speaks of.
+    pub(super) fn grid(&self) -> Grid {
+        match &self.says {
+            Says::Model(model) => Grid::of(model.network()),
+            Says::Always(_, grid) => *grid,
+        }
+    }
+
     /// By what it is known again.
     fn identity(&self) -> String {
         match &self.says {
@@ -57,7 +67,7 @@ impl Predictor {
     }
 
     /// Refuses a model of other classes than the set's.
-    fn check(&self, classes: usize, data: &str) -> Result<()> {
+    pub(super) fn check(&self, classes: usize, data: &str) -> Result<()> {
         let Says::Model(model) = &self.says else { return Ok(()) };
         let found = model.network().classes;
         if found == classes {
@@ -101,6 +111,12 @@ pub struct Means {
     pub isa: Isa,
 }
 
+impl Means {
+    /// Frames at a time where nobody says how many: one, which takes the least memory, on every machine the same. The program
+    /// and the Python package have it from here; `benches/workers.rs` compares it with more.
+    pub const WORKERS: usize = 1;
+}
+
 /// One or two predictors, the data set on which they are scored, and how.
 pub struct Evaluation {
     set: Box<dyn DataSet>,
@@ -125,11 +141,8 @@ impl Evaluation {
     pub fn new(set: Box<dyn DataSet>, data: &str, predictors: Vec<Predictor>, scope: &Scope) -> Result<Self> {
         let with_scorer = |predictor: Predictor| {
             predictor.check(set.classes().len(), data)?;
-            let grid = match &predictor.says {
-                Says::Model(model) => Grid::of(model.network()),
-                Says::Always(_, grid) => *grid,
-            };
-            let scorer = Scorer::new(set.classes().len(), set.masks().len(), set.grid(), grid, &scope.options)?;
+            let grids = [set.grid(), predictor.grid()];
+            let scorer = Scorer::new(set.classes().len(), set.masks().len(), grids[0], grids[1], &scope.options)?;
             Ok((predictor, scorer.with_published(set.published())))
         };
         let predictors = predictors.into_iter().map(with_scorer).collect::<Result<Vec<_>>>()?;
@@ -198,9 +211,9 @@ impl Evaluation {
         Err(Error::format(format!("frame {} is {found:?}, expected {expected:?}", entry.index)))
     }
 
-    /// Scores the frames that `totals` lacks, and counts them. `watch` is told how many are done, on the calling
-    /// thread, a few times a second and whenever a frame is; what it returns as an error ends the evaluation once
-    /// the frames under way are done. Every frame that was done is counted, and in the journal, in any case.
+    /// Scores the frames that `totals` lacks, and counts them. `watch` is told how many are done and what of their images has
+    /// not been said yet, on the calling thread, a few times a second and whenever a frame is; what it returns as an error
+    /// ends the evaluation once the frames under way are done. Every frame that was done is counted, and in the journal, in any case.
     ///
     /// # Errors
     /// The first of `watch`, of a frame, or of the journal.
@@ -209,13 +222,13 @@ impl Evaluation {
         means: &Means,
         totals: &mut Totals,
         mut journal: Option<&mut Journal>,
-        watch: &mut dyn FnMut(usize) -> Result<()>,
+        watch: &mut dyn FnMut(usize, &[Note]) -> Result<()>,
     ) -> Result<()> {
         let left = self.left(totals);
         let workers = means.workers.min(left.len());
         let threads = (means.threads / workers.max(1)).max(1);
         let next = AtomicUsize::new(0);
-        let (sender, results) = channel::<Result<Entry>>();
+        let (sender, results) = channel::<Result<(Entry, Vec<Note>)>>();
         std::thread::scope(|scope| {
             for _ in 0..workers {
                 let (sender, left, next) = (sender.clone(), &left, &next);
@@ -223,8 +236,9 @@ impl Evaluation {
                     let work = || -> Result<()> {
                         let mut worker = Worker::new(self.clone(), means.isa, Threads::new(threads)?);
                         while let Some(&index) = left.get(next.fetch_add(1, Ordering::Relaxed)) {
+                            let entry = worker.score(index)?;
                             // Whoever waits has gone only if a panic is on its way there.
-                            let _ = sender.send(Ok(worker.score(index)?));
+                            let _ = sender.send(Ok((entry, worker.take_notes())));
                         }
                         Ok(())
                     };
@@ -234,10 +248,12 @@ impl Evaluation {
                 });
             }
             drop(sender);
-            let (mut done, mut failed) = (0, None);
+            let (mut done, mut failed, mut said) = (0, None, Said::default());
             loop {
+                let mut notes = Vec::new();
                 let outcome = match results.recv_timeout(TICK) {
-                    Ok(Ok(entry)) => {
+                    Ok(Ok((entry, of_frame))) => {
+                        notes = of_frame;
                         let kept = journal.as_mut().map_or(Ok(()), |journal| journal.append(&entry));
                         totals.add(entry.index, entry.score);
                         done += 1;
@@ -248,7 +264,7 @@ impl Evaluation {
                     Err(RecvTimeoutError::Disconnected) => break,
                 };
                 if failed.is_none()
-                    && let Err(error) = outcome.and_then(|()| watch(done))
+                    && let Err(error) = outcome.and_then(|()| watch(done, said.fresh(notes)))
                 {
                     next.store(left.len(), Ordering::Relaxed);
                     failed = Some(error);
@@ -271,6 +287,8 @@ pub struct Worker {
     options: SessionOptions,
     /// For each predictor that is a model, the means to run it, made for its first frame.
     running: Vec<Option<Moving>>,
+    /// What is to be said of the frames since [`Worker::take_notes`].
+    notes: Vec<Note>,
 }
 
 impl Worker {
@@ -278,7 +296,12 @@ impl Worker {
     pub fn new(evaluation: Arc<Evaluation>, isa: Isa, threads: Threads) -> Self {
         let options = SessionOptions { isa, threads, logits: evaluation.what().losses, ..SessionOptions::default() };
         let running = evaluation.predictors.iter().map(|_| None).collect();
-        Self { evaluation, options, running }
+        Self { evaluation, options, running, notes: Vec::new() }
+    }
+
+    /// What is to be said of the frames that were read since the last call ([`DataSet::scene`]).
+    pub fn take_notes(&mut self) -> Vec<Note> {
+        std::mem::take(&mut self.notes)
     }
 
     /// Scores frame `index` of the set.
@@ -294,7 +317,8 @@ impl Worker {
         let (scene, truth) = if blind {
             (None, set.truth(index)?)
         } else {
-            let Frame { scene, truth } = set.frame(index)?;
+            let Frame { scene, truth, notes } = set.frame(index)?;
+            self.notes.extend(notes);
             (Some(scene), truth)
         };
         let said = |e: Error| match e.path() {
@@ -306,13 +330,8 @@ impl Worker {
         for ((Predictor { says, .. }, scorer), running) in predictors.iter().zip(&mut self.running) {
             let prediction = match (says, &scene) {
                 (Says::Model(model), Some(scene)) => {
-                    scene.check(model.network()).map_err(said)?;
-                    let running = match running {
-                        Some(running) => running,
-                        none => none.insert(Moving::new(model, None, scene, &self.options).map_err(said)?),
-                    };
-                    running.calibrate(scene).map_err(said)?;
-                    let Occupancy { classes, support, logits, .. } = running.session.run_scene(scene).map_err(said)?;
+                    let Occupancy { classes, support, logits, .. } =
+                        run(running, model, scene, &self.options).map_err(said)?;
                     Prediction { classes, support: Some(support), logits }
                 }
                 (Says::Always(classes, _), _) => Prediction { classes, support: None, logits: None },
@@ -332,4 +351,20 @@ impl Worker {
         }
         Ok(Entry { frame: set.id(index).to_owned(), index, score })
     }
+}
+
+/// What a model makes of a scene, with a session that is made for the first one.
+pub(super) fn run<'r>(
+    running: &'r mut Option<Moving>,
+    model: &Arc<Model>,
+    scene: &Scene,
+    options: &SessionOptions,
+) -> Result<Occupancy<'r>> {
+    scene.check(model.network())?;
+    let running = match running {
+        Some(running) => running,
+        none => none.insert(Moving::new(model, None, scene, options)?),
+    };
+    running.calibrate(scene)?;
+    running.session.run_scene(scene)
 }

@@ -32,7 +32,9 @@ pub fn majority(set: &dyn DataSet, done: &mut dyn FnMut(usize)) -> Result<Vec<u8
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::eval::dataset::{Axes, Frame, Grid, Pose, Truth};
+    use crate::base::note::Note;
+    use crate::eval::dataset::{Axes, Grid, Pose, Truth};
+    use crate::scene::Scene;
 
     /// Labels of three frames of five voxels.
     struct Three;
@@ -46,10 +48,6 @@ mod tests {
             Grid { size: [5, 1, 1], bounds: [[0.0, 5.0], [0.0, 1.0], [0.0, 1.0]], axes: Axes::Lidar }
         }
 
-        fn masks(&self) -> &[&'static str] {
-            &[]
-        }
-
         fn len(&self) -> usize {
             3
         }
@@ -58,7 +56,7 @@ mod tests {
             ["a", "b", "c"][index]
         }
 
-        fn frame(&self, _index: usize) -> Result<Frame> {
+        fn scene(&self, _index: usize) -> Result<(Scene, Vec<Note>)> {
             Err(Error::format("images are not needed"))
         }
 

@@ -21,6 +21,7 @@ mod majority;
 pub mod ray_iou;
 mod report;
 mod subject;
+mod submission;
 mod summary;
 mod table;
 mod totals;
@@ -33,6 +34,7 @@ pub use journal::{Entry, Header, Journal, JournalReader};
 pub use majority::majority;
 pub use report::Report;
 pub use subject::{Shard, Subject};
+pub use submission::{ABOUT, write_submission};
 pub use summary::Summary;
 pub use totals::{FrameScore, Totals};
 

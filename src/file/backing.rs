@@ -48,6 +48,17 @@ impl Backing {
         Ok(Self::Mapped(map))
     }
 
+    /// Lets go of the mapped pages that a look at the whole file has brought in, so that what nothing uses takes no memory. Those
+    /// that are used come back from the system's cache.
+    pub(crate) fn release(&self) {
+        #[cfg(unix)]
+        if let Backing::Mapped(map) = self {
+            // SAFETY: the map is read-only and shared with a file that nobody changes ([`Backing::map`]), so pages that come
+            // back hold what they held. A refusal changes nothing.
+            let _ = unsafe { map.unchecked_advise(memmap2::UncheckedAdvice::DontNeed) };
+        }
+    }
+
     /// Copies the file at `path`.
     pub(crate) fn read(path: &Path) -> Result<Self> {
         let (mut file, len) = open(path)?;
@@ -109,6 +120,20 @@ mod tests {
             copies += usize::from(matches!(backing, Backing::Copied { .. }));
         }
         assert_eq!(copies, 18, "three of four places are between elements");
+    }
+
+    #[test]
+    fn pages_that_were_let_go_come_back() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("file");
+        let bytes: Vec<u8> = (0..100_000).map(|i| (i / 7) as u8).collect();
+        fs::write(&path, &bytes).unwrap();
+        let mapped = Backing::map(&path).unwrap();
+        for _ in 0..2 {
+            assert_eq!(mapped[..], bytes);
+            mapped.release();
+        }
+        assert_eq!(mapped[..], bytes);
     }
 
     #[test]

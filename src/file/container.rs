@@ -232,7 +232,9 @@ impl Container {
     /// [`ErrorKind::Io`] if it cannot be opened or is no regular file, else as [`Container::from_bytes`]; each names
     /// the file.
     pub fn open(path: &Path) -> Result<Self> {
-        Self::new(Backing::map(path)?).map_err(|e| e.in_file(path))
+        let container = Self::new(Backing::map(path)?).map_err(|e| e.in_file(path))?;
+        container.bytes.release();
+        Ok(container)
     }
 
     /// Copies the file at `path` into memory and checks the copy: nothing that happens to the file later matters.

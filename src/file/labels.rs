@@ -104,10 +104,10 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let network = crate::Network::built_in("edge").unwrap();
         let frame = crate::synth::Synthesiser::new(&network).unwrap().frame(3);
-        let grid = network.output_grid();
+        let grid = crate::network::Grid::of(&network);
         frame.save_scene(directory.path(), grid).unwrap();
         for file in ["labels.npz", "labels.npy"] {
-            assert!(read_labels(&directory.path().join(file), grid).unwrap() == frame.labels, "{file}");
+            assert!(read_labels(&directory.path().join(file), grid.size).unwrap() == frame.labels, "{file}");
         }
     }
 

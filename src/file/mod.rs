@@ -1,4 +1,4 @@
-//! Files as bytes: the container of models and rigs, mapped or read; NumPy arrays; label files; replacing a file whole.
+//! Files as bytes: the container of models and rigs, mapped or read; NumPy arrays; label files; pickles; replacing a file whole.
 
 pub(crate) mod backing;
 pub(crate) mod bounded;
@@ -7,4 +7,6 @@ pub mod container;
 pub mod labels;
 #[cfg(feature = "npz")]
 pub mod npz;
+#[cfg(any(feature = "eval", feature = "import"))]
+pub(crate) mod pickle;
 pub(crate) mod replace;

@@ -18,7 +18,7 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 pub enum Elements<'a> {
     /// Unsigned bytes, NumPy's `uint8`.
     U8(&'a [u8]),
-    /// Unsigned 16-bit numbers, NumPy's `uint16`.
+    /// Unsigned 16-bit integers, NumPy's `uint16`.
     U16(&'a [u16]),
     /// Single precision floats, NumPy's `float32`.
     F32(&'a [f32]),
@@ -40,7 +40,7 @@ pub struct Array<'a> {
 pub enum OwnedElements {
     /// Unsigned bytes.
     U8(Vec<u8>),
-    /// Unsigned 16-bit numbers.
+    /// Unsigned 16-bit integers.
     U16(Vec<u16>),
     /// Single precision floats, bit for bit as stored.
     F32(Vec<f32>),
@@ -147,19 +147,19 @@ fn write_array<W: Write + Seek>(zip: &mut ZipWriter<W>, array: &Array<'_>) -> io
     zip.write_all(&header)?;
     match array.elements {
         Elements::U8(v) => zip.write_all(v),
-        Elements::U16(v) => write_numbers(zip, v, |n| n.to_le_bytes()),
-        Elements::F32(v) => write_numbers(zip, v, |n| n.to_le_bytes()),
+        Elements::U16(v) => write_elements(zip, v, |n| n.to_le_bytes()),
+        Elements::F32(v) => write_elements(zip, v, |n| n.to_le_bytes()),
     }
 }
 
-/// Writes numbers through a small buffer, as the bytes that `bytes` makes of each.
-fn write_numbers<T: Copy, const N: usize>(
+/// Writes elements through a small buffer, as the bytes that `bytes` makes of each.
+fn write_elements<T: Copy, const N: usize>(
     out: &mut impl Write,
-    numbers: &[T],
+    elements: &[T],
     bytes: impl Fn(T) -> [u8; N],
 ) -> io::Result<()> {
     let mut buffer = Vec::with_capacity(1 << 16);
-    for part in numbers.chunks((1 << 16) / N) {
+    for part in elements.chunks((1 << 16) / N) {
         buffer.clear();
         buffer.extend(part.iter().flat_map(|&n| bytes(n)));
         out.write_all(&buffer)?;
@@ -199,12 +199,26 @@ pub fn read_npz(path: &Path) -> Result<Vec<OwnedArray>> {
 }
 
 fn read_from(reader: impl Read + Seek, length: u64) -> Result<Vec<OwnedArray>> {
+    let mut arrays = Vec::new();
+    each_entry(reader, length, |name, entry, size| {
+        let (shape, elements) = read_array(entry, size)?;
+        arrays.push(OwnedArray { name: name.to_owned(), shape, elements });
+        Ok(())
+    })?;
+    Ok(arrays)
+}
+
+/// Hands on every `.npy` of an archive of `length` bytes: its name, its bytes and how many they are.
+fn each_entry(
+    reader: impl Read + Seek,
+    length: u64,
+    mut read: impl FnMut(&str, &mut dyn Read, u64) -> Result<()>,
+) -> Result<()> {
     let mut zip = ZipArchive::new(reader).map_err(|e| Error::format(format!("not an .npz: {e}")))?;
     if zip.len() > MAX_ARRAYS {
         return Err(Error::format(format!("{} entries, expected at most {MAX_ARRAYS}", zip.len())));
     }
     let mut budget = length.saturating_mul(MAX_RATIO);
-    let mut arrays = Vec::new();
     for index in 0..zip.len() {
         let mut entry = zip.by_index(index).map_err(|e| Error::format(format!("entry {index}: {e}")))?;
         let full_name = entry.name().map_err(|e| Error::format(format!("entry {index}: {e}")))?.into_owned();
@@ -213,17 +227,75 @@ fn read_from(reader: impl Read + Seek, length: u64) -> Result<Vec<OwnedArray>> {
             return Err(Error::format(format!("entry {full_name:?} claims {size} bytes, expected at most {budget}")));
         }
         budget -= size;
-        let Some(name) = full_name.strip_suffix(".npy").map(str::to_owned) else { continue };
-        let array = read_array(&mut entry, size).map_err(|e| {
+        let Some(name) = full_name.strip_suffix(".npy") else { continue };
+        read(name, &mut entry, size).map_err(|e| {
             // The kind stays; the entry's name goes in front, as the path does later.
             Error::new(e.kind(), format!("entry {full_name:?}: {}", e.message()))
         })?;
-        arrays.push(OwnedArray { name, shape: array.0, elements: array.1 });
     }
-    Ok(arrays)
+    Ok(())
 }
 
-fn read_array(entry: &mut impl Read, size: u64) -> Result<(Vec<usize>, OwnedElements)> {
+/// An array as it is stored, of any type of elements.
+#[cfg(feature = "eval")]
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct RawArray {
+    /// Its name, without `.npy`.
+    pub(crate) name: String,
+    /// The type of the elements, such as `<f4`; `|O` for objects.
+    pub(crate) descr: String,
+    /// Whether the first axis is the fastest.
+    pub(crate) fortran: bool,
+    /// Lengths of the axes, slowest first.
+    pub(crate) shape: Vec<usize>,
+    /// The elements; those of objects are a pickle.
+    pub(crate) bytes: Vec<u8>,
+}
+
+#[cfg(feature = "eval")]
+impl RawArray {
+    /// The elements of an array of integers or truth values, in C order.
+    ///
+    /// # Errors
+    /// Those of [`read_npy_integers`] for its elements and their order.
+    pub(crate) fn integers(&self) -> Result<Vec<i64>> {
+        // A truth value is a byte.
+        let descr = if self.descr == "|b1" { "|u1" } else { &self.descr };
+        let kind = IntegerKind::of(descr, self.fortran, &self.shape)?;
+        if product(&self.shape).and_then(|n| n.checked_mul(kind.item)) != Some(self.bytes.len()) {
+            let (found, shape, item) = (self.bytes.len(), &self.shape, kind.item);
+            return Err(Error::format(format!("{found} bytes, expected shape {shape:?} of {item} bytes each")));
+        }
+        kind.integers(&self.bytes)
+    }
+}
+
+/// Reads those arrays of the `.npz` at `path` that are called one of `names`, as they are stored.
+///
+/// # Errors
+/// As [`read_npz`].
+#[cfg(feature = "eval")]
+pub(crate) fn read_npz_raw(path: &Path, names: &[&str]) -> Result<Vec<RawArray>> {
+    let read = || {
+        let file = File::open(path).map_err(|e| Error::io(path, "open", &e))?;
+        let length = file.metadata().map_err(|e| Error::io(path, "read", &e))?.len();
+        let mut arrays = Vec::new();
+        each_entry(BufReader::new(file), length, |name, entry, size| {
+            if !names.contains(&name) {
+                return Ok(());
+            }
+            let (literal, header) = read_header(entry)?;
+            let (descr, fortran, shape) = parse_header(&literal)?;
+            let bytes = read_rest(entry, header, size)?;
+            arrays.push(RawArray { name: name.to_owned(), descr: descr.to_owned(), fortran, shape, bytes });
+            Ok(())
+        })?;
+        Ok(arrays)
+    };
+    read().map_err(|e: Error| e.in_file(path))
+}
+
+fn read_array(entry: &mut (impl Read + ?Sized), size: u64) -> Result<(Vec<usize>, OwnedElements)> {
     let (literal, header) = read_header(entry)?;
     // Records have a list for a type. They are well formed, and nobody needs them here.
     let (descr, fortran, shape) = match parse_header(&literal) {
@@ -258,7 +330,7 @@ fn read_array(entry: &mut impl Read, size: u64) -> Result<(Vec<usize>, OwnedElem
 }
 
 /// The literal at the start of an `.npy`, and the bytes up to the elements.
-fn read_header(entry: &mut impl Read) -> Result<(String, u64)> {
+fn read_header(entry: &mut (impl Read + ?Sized)) -> Result<(String, u64)> {
     let mut start = [0u8; 8];
     entry.read_exact(&mut start).map_err(unreadable)?;
     if &start[..6] != b"\x93NUMPY" || !(1..=3).contains(&start[6]) {
@@ -278,16 +350,29 @@ fn read_header(entry: &mut impl Read) -> Result<(String, u64)> {
 }
 
 /// The elements of `item` bytes behind a header of `header` bytes, in an entry of `size`.
-fn read_elements(entry: &mut impl Read, shape: &[usize], item: usize, header: u64, size: u64) -> Result<Vec<u8>> {
+fn read_elements(
+    entry: &mut (impl Read + ?Sized),
+    shape: &[usize],
+    item: usize,
+    header: u64,
+    size: u64,
+) -> Result<Vec<u8>> {
     let expected = product(shape).and_then(|n| n.checked_mul(item)).map(|n| n as u64);
     if expected.is_none_or(|n| Some(header) != size.checked_sub(n)) {
         return Err(Error::format(format!("{size} bytes, expected shape {shape:?} of {item} bytes each")));
     }
+    read_rest(entry, header, size)
+}
+
+/// What is behind a header of `header` bytes, in an entry of `size`.
+fn read_rest(entry: &mut (impl Read + ?Sized), header: u64, size: u64) -> Result<Vec<u8>> {
+    let expected =
+        size.checked_sub(header).ok_or_else(|| Error::format(format!("{size} bytes, less than its header")))?;
     // One byte more than expected is asked for, so that the end of the entry is seen and its checksum compared.
     let mut bytes = Vec::new();
-    entry.take(size - header + 1).read_to_end(&mut bytes).map_err(unreadable)?;
-    if bytes.len() as u64 != size - header {
-        return Err(Error::format(format!("{} bytes of elements, expected {}", bytes.len(), size - header)));
+    entry.take(expected + 1).read_to_end(&mut bytes).map_err(unreadable)?;
+    if bytes.len() as u64 != expected {
+        return Err(Error::format(format!("{} bytes of elements, expected {expected}", bytes.len())));
     }
     Ok(bytes)
 }
@@ -312,36 +397,52 @@ pub fn read_npy_integers(path: &Path) -> Result<(Vec<usize>, Vec<i64>)> {
 fn read_integers(file: &mut impl Read, size: u64) -> Result<(Vec<usize>, Vec<i64>)> {
     let (literal, header) = read_header(file)?;
     let (descr, fortran, shape) = parse_header(&literal)?;
-    // The order of one axis, and of none, is both.
-    if fortran && shape.len() > 1 {
-        return Err(Error::new(ErrorKind::Unsupported, "Fortran order, expected C order"));
-    }
-    let unsupported = || {
-        let message = format!("elements of type {descr:?}, expected little-endian integers such as \"<i8\"");
-        Error::new(ErrorKind::Unsupported, message)
-    };
-    let (order, kind) = descr.split_at_checked(1).ok_or_else(unsupported)?;
-    let signed = kind.starts_with('i');
-    let item = match kind {
-        "i1" | "u1" if "|<".contains(order) => 1,
-        "i2" | "u2" if order == "<" => 2,
-        "i4" | "u4" if order == "<" => 4,
-        "i8" | "u8" if order == "<" => 8,
-        _ => return Err(unsupported()),
-    };
-    let bytes = read_elements(file, &shape, item, header, size)?;
-    let integer = |bytes: &[u8]| {
-        let negative = signed && bytes[item - 1] >= 0x80;
-        let mut wide = [if negative { 0xff } else { 0 }; 8];
-        wide[..item].copy_from_slice(bytes);
-        let number = i64::from_le_bytes(wide);
-        if !signed && number < 0 {
-            return Err(Error::format(format!("element {}, expected at most {}", number as u64, i64::MAX)));
+    let kind = IntegerKind::of(descr, fortran, &shape)?;
+    let bytes = read_elements(file, &shape, kind.item, header, size)?;
+    Ok((shape, kind.integers(&bytes)?))
+}
+
+/// A type of integers.
+struct IntegerKind {
+    /// Its bytes.
+    item: usize,
+    signed: bool,
+}
+
+impl IntegerKind {
+    fn of(descr: &str, fortran: bool, shape: &[usize]) -> Result<Self> {
+        // The order of one axis, and of none, is both.
+        if fortran && shape.len() > 1 {
+            return Err(Error::new(ErrorKind::Unsupported, "Fortran order, expected C order"));
         }
-        Ok(number)
-    };
-    let integers = bytes.chunks_exact(item).map(integer).collect::<Result<_>>()?;
-    Ok((shape, integers))
+        let unsupported = || {
+            let message = format!("elements of type {descr:?}, expected little-endian integers such as \"<i8\"");
+            Error::new(ErrorKind::Unsupported, message)
+        };
+        let (order, kind) = descr.split_at_checked(1).ok_or_else(unsupported)?;
+        let item = match kind {
+            "i1" | "u1" if "|<".contains(order) => 1,
+            "i2" | "u2" if order == "<" => 2,
+            "i4" | "u4" if order == "<" => 4,
+            "i8" | "u8" if order == "<" => 8,
+            _ => return Err(unsupported()),
+        };
+        Ok(Self { item, signed: kind.starts_with('i') })
+    }
+
+    fn integers(&self, bytes: &[u8]) -> Result<Vec<i64>> {
+        let integer = |bytes: &[u8]| {
+            let negative = self.signed && bytes[self.item - 1] >= 0x80;
+            let mut wide = [if negative { 0xff } else { 0 }; 8];
+            wide[..self.item].copy_from_slice(bytes);
+            let number = i64::from_le_bytes(wide);
+            if !self.signed && number < 0 {
+                return Err(Error::format(format!("element {}, expected at most {}", number as u64, i64::MAX)));
+            }
+            Ok(number)
+        };
+        bytes.chunks_exact(self.item).map(integer).collect()
+    }
 }
 
 /// The element type, whether the order is Fortran's, and the shape of a header such as `{'descr': '<f4', 'fortran_order': False, 'shape': (2, 3), }`.

@@ -3,9 +3,7 @@
 use crate::base::error::{Error, ErrorKind, Result};
 use std::ffi::OsString;
 use std::fs::{self, File, OpenOptions};
-use std::io;
-#[cfg(any(feature = "npz", feature = "images"))]
-use std::io::{BufWriter, Write};
+use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 /// Writes `path` through a temporary file beside it, which takes its name once all bytes are down.
@@ -14,7 +12,6 @@ use std::path::{Path, PathBuf};
 ///
 /// # Errors
 /// [`ErrorKind::Io`] naming `path`.
-#[cfg(any(feature = "npz", feature = "images"))]
 pub(crate) fn replace_file(path: &Path, write: impl FnOnce(&mut BufWriter<&File>) -> io::Result<()>) -> Result<()> {
     let replacement = Replacement::create(path)?;
     let mut out = BufWriter::with_capacity(1 << 18, &replacement.file);

@@ -24,6 +24,7 @@ impl Graph {
     #[must_use]
     pub fn rewritten(self, rewrites: Rewrites) -> Self {
         let graph = if rewrites.batch_norm { self.fold_batch_norm() } else { self };
-        if rewrites.projection { graph.fold_projection() } else { graph }
+        let graph = if rewrites.projection { graph.fold_projection() } else { graph };
+        if rewrites.winograd { graph.use_winograd() } else { graph }
     }
 }

@@ -22,11 +22,14 @@ pub struct Rewrites {
     pub batch_norm: bool,
     /// Pyramid convolution, mean and both 1x1 convolutions become one convolution and a mean. Needs `batch_norm`.
     pub projection: bool,
+    /// Convolutions are computed by Winograd's minimal filtering where their shapes make it worth while. Other bits than
+    /// direct sums.
+    pub winograd: bool,
 }
 
 impl Rewrites {
     /// Everything on: the fastest graph.
-    pub const ALL: Self = Self { batch_norm: true, projection: true };
+    pub const ALL: Self = Self { batch_norm: true, projection: true, winograd: true };
     /// Everything off: the published operations one by one.
-    pub const NONE: Self = Self { batch_norm: false, projection: false };
+    pub const NONE: Self = Self { batch_norm: false, projection: false, winograd: false };
 }

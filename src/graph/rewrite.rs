@@ -2,10 +2,11 @@
 
 use super::matrices::Matrix;
 use super::operation::{Graph, Operation};
-use super::ops::{BatchNorm, Conv, Gather, Op};
+use super::ops::{BatchNorm, Conv, Gather, Op, Winograd};
 use super::recipe::{ConvNames, Recipe};
 use super::tensor::TensorId;
 use voxcast_kernels::conv::Geometry;
+use voxcast_kernels::winograd::Shape;
 
 impl Graph {
     /// Moves every batch norm into the convolution whose result it reads: scale into the weights, shift into the bias.
@@ -55,6 +56,23 @@ impl Graph {
     pub fn fold_projection(mut self) -> Self {
         for level in 0..3 {
             self.fold_level(level);
+        }
+        self
+    }
+
+    /// Computes convolutions by Winograd's minimal filtering where [`Shape::best`] says so: from their shapes alone. What they
+    /// read and write, and all that surrounds them, stays. Nothing that folds convolutions may come after it.
+    ///
+    /// Transformed weights may take as much memory as the maps where every camera's pass reads them, and half as much where they
+    /// are read once in a frame.
+    #[must_use]
+    pub fn use_winograd(mut self) -> Self {
+        for (index, operation) in self.operations.iter_mut().enumerate() {
+            let Op::Conv(Conv { geometry }) = operation.op else { continue };
+            let share = if index < self.camera_operations { 1 } else { 2 };
+            if let Some(shape) = Shape::best(&geometry, operation.channels, share) {
+                operation.op = Winograd { geometry, shape }.into();
+            }
         }
         self
     }

@@ -1,6 +1,6 @@
 //! The graph against the figures that are known of the published network.
 
-use super::ops::{BatchNorm, Conv, DeformConv};
+use super::ops::{BatchNorm, Conv, DeformConv, Winograd};
 use super::*;
 use crate::network::Network;
 use std::collections::BTreeSet;
@@ -24,7 +24,9 @@ fn assert_near(found: f64, expected: f64, what: &str) {
 
 fn geometry(operation: &Operation) -> Option<Geometry> {
     match operation.op {
-        Op::Conv(Conv { geometry }) | Op::DeformConv(DeformConv { geometry }) => Some(geometry),
+        Op::Conv(Conv { geometry })
+        | Op::DeformConv(DeformConv { geometry })
+        | Op::Winograd(Winograd { geometry, .. }) => Some(geometry),
         _ => None,
     }
 }
@@ -132,7 +134,46 @@ fn every_rewrite_leaves_a_sound_graph() {
             assert_sound(&all);
             assert_eq!(folded.operations.len() - all.operations.len(), 6, "two convolutions of each level");
             assert_eq!(all.clone().fold_projection().fold_batch_norm(), all, "nothing is left to fold");
+            let filtered = all.clone().use_winograd();
+            assert_sound(&filtered);
+            assert_eq!(filtered.clone().use_winograd(), filtered, "nothing is left to choose");
         }
+    }
+}
+
+/// Only what computes a convolution changes, and only where it is worth it: never more multiply-adds, and never weights
+/// that are larger than the maps.
+#[test]
+fn winograd_saves_work_and_leaves_all_else() {
+    let mut executed = vec![];
+    for (name, image) in [("nuscenes-200", [928, 1600]), ("nuscenes-200", [256, 704]), ("edge", [128, 352])] {
+        let network = Network { image, ..Network::built_in(name).expect("built in") };
+        let direct = Graph::build(&network, Results::ALL).fold_batch_norm().fold_projection();
+        let graph = direct.clone().use_winograd();
+        assert_eq!((&graph.tensors, graph.camera_operations), (&direct.tensors, direct.camera_operations));
+        assert_eq!(graph.operations.len(), direct.operations.len());
+        for (index, (new, old)) in graph.operations.iter().zip(&direct.operations).enumerate() {
+            assert_eq!(graph.multiply_adds(new), direct.multiply_adds(old), "{}", old.name);
+            match new.op {
+                Op::Winograd(Winograd { shape, geometry }) => {
+                    assert_eq!(Op::from(Conv { geometry }), old.op, "{}", old.name);
+                    assert!(2 * graph.executed_multiply_adds(new) < graph.multiply_adds(new), "{}", old.name);
+                    let maps = graph.tensor(new.inputs[0]).len() + geometry.rows() * new.channels;
+                    let most = if index < graph.camera_operations { maps } else { maps / 2 };
+                    assert!(shape.weights_len() <= most, "{}", old.name);
+                }
+                _ => assert_eq!(new, old),
+            }
+            let restored = Operation { op: old.op.clone(), ..new.clone() };
+            assert_eq!(&restored, old);
+        }
+        let count = |o: &Operation| matches!(o.op, Op::Winograd(_));
+        let all: u64 = graph.operations.iter().filter(|o| count(o)).map(|o| graph.multiply_adds(o)).sum();
+        let left: u64 = graph.operations.iter().filter(|o| count(o)).map(|o| graph.executed_multiply_adds(o)).sum();
+        executed.push((graph.operations.iter().filter(|o| count(o)).count(), all as f64 / left as f64));
+    }
+    for (count, saved) in executed {
+        assert!(count >= 14 && saved > 2.3, "{count} operations, {saved:.2} times fewer multiply-adds");
     }
 }
 

@@ -5,7 +5,7 @@ use super::file::{Channel, Ending, Extent, Log, Place};
 use super::join::{Join, join};
 use super::lens::{Lens, Undistortion};
 use super::message::{self, Calibration, Encoded, Kind, Pixels};
-use super::sources::{self, Camera, Topic};
+use super::sources::{self, CameraTopics, Topic};
 use super::transforms::{Tree, seconds};
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::base::note::Note;
@@ -80,7 +80,7 @@ pub struct ReplayFrame {
 /// A log as frames, in the order of time.
 pub struct Replay {
     log: Log,
-    cameras: Vec<Source>,
+    cameras: Vec<CameraLog>,
     frames: Vec<Moment>,
     summary: Summary,
 }
@@ -98,8 +98,8 @@ struct Moment {
 type Calibrations = Vec<(Stamp, Arc<Calibration>)>;
 
 /// A camera with what the log has of it.
-struct Source {
-    camera: Camera,
+struct CameraLog {
+    camera: CameraTopics,
     /// In the order of their stamps.
     images: Vec<ImageAt>,
     calibrations: Calibrations,
@@ -194,7 +194,7 @@ impl Replay {
             let mut calibrations = found.unwrap_or_default();
             images.sort_by_key(|image| image.stamp);
             calibrations.sort_by_key(|(stamp, _)| *stamp);
-            sources.push(Source { camera, images, calibrations, undistortion: None });
+            sources.push(CameraLog { camera, images, calibrations, undistortion: None });
         }
         let stamps: Vec<Vec<Stamp>> =
             sources.iter().map(|source| source.images.iter().map(|image| image.stamp).collect()).collect();
@@ -332,9 +332,9 @@ struct Placement<'a> {
 
 impl Placement<'_> {
     /// `lidar2img` of every camera: the camera at its image's time, the lidar at the frame's.
-    fn matrices(&self, sources: &[Source], join: &Join, notes: &mut Vec<Note>) -> Result<Vec<[f32; 16]>> {
+    fn matrices(&self, sources: &[CameraLog], join: &Join, notes: &mut Vec<Note>) -> Result<Vec<[f32; 16]>> {
         let (root, lidar) = self.tree.in_root(self.lidar, join.time, self.slack)?;
-        let matrix = |(source, image): (&Source, &Option<usize>)| {
+        let matrix = |(source, image): (&CameraLog, &Option<usize>)| {
             let stamp = image.map_or(join.time, |image| source.images[image].stamp);
             let frame = &source.camera.frame;
             let (other, camera) = self.tree.in_root(frame, stamp, self.slack)?;
@@ -366,14 +366,14 @@ fn clear(row: &mut [f32]) {
     row.iter_mut().filter(|v| v.abs() < 1e-12 * largest).for_each(|v| *v = 0.0);
 }
 
-impl Source {
+impl CameraLog {
     /// The calibration that holds at `stamp`: the last one before, or else the first.
     fn calibration(&self, stamp: Stamp) -> &Arc<Calibration> {
         let after = self.calibrations.partition_point(|(at, _)| *at <= stamp);
         &self.calibrations[after.saturating_sub(1)].1
     }
 
-    /// The camera matrix of the images that [`Source::decode`] gives.
+    /// The camera matrix of the images that [`CameraLog::decode`] gives.
     fn matrix(&self, calibration: &Calibration) -> [[f64; 3]; 3] {
         let Calibration { k, p, .. } = calibration;
         match self.camera.rectified && p[0] != 0.0 {
@@ -435,7 +435,7 @@ fn size_of(calibration: &Calibration) -> Result<Option<[usize; 2]>> {
 }
 
 /// What stands for an image that is missing.
-fn blank(calibration: &Calibration, camera: &Camera) -> Result<Image> {
+fn blank(calibration: &Calibration, camera: &CameraTopics) -> Result<Image> {
     let Some([height, width]) = size_of(calibration)? else {
         let message =
             format!("camera {}: an image is missing, and the calibration does not state its size", camera.name);

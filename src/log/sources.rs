@@ -13,7 +13,7 @@ pub(super) struct Topic {
 
 /// A camera of a log.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Camera {
+pub(super) struct CameraTopics {
     pub(super) name: String,
     /// Topic of its images.
     pub(super) images: String,
@@ -40,7 +40,7 @@ pub(super) fn find(
     calibrations: &[Topic],
     named: &[(String, String)],
     expected: usize,
-) -> Result<Vec<Camera>> {
+) -> Result<Vec<CameraTopics>> {
     let mut chosen: Vec<(String, &Topic)> = match named {
         [] => called(images)?,
         named => named
@@ -66,7 +66,7 @@ pub(super) fn find(
         let frame = if topic.frame.is_empty() { calibration.frame.clone() } else { topic.frame.clone() };
         let (_, about) = parts(&topic.name);
         let rectified = about.iter().any(|part| part.starts_with("image_rect"));
-        Ok(Camera { name, images: topic.name.clone(), calibration: calibration.name.clone(), frame, rectified })
+        Ok(CameraTopics { name, images: topic.name.clone(), calibration: calibration.name.clone(), frame, rectified })
     };
     chosen.into_iter().map(camera).collect()
 }
@@ -151,7 +151,7 @@ mod tests {
         names.iter().map(|&(name, frame)| Topic { name: name.to_owned(), frame: frame.to_owned() }).collect()
     }
 
-    fn names(cameras: &[Camera]) -> Vec<&str> {
+    fn names(cameras: &[CameraTopics]) -> Vec<&str> {
         cameras.iter().map(|camera| camera.name.as_str()).collect()
     }
 

@@ -3,7 +3,7 @@
 use super::schema::{self, Schema, descriptors};
 use super::*;
 use crate::base::error::{ErrorKind, Result};
-use crate::network::Network;
+use crate::network::{Grid, Network};
 use crate::runtime::session::{CameraStatus, Occupancy};
 use crate::scene::{Image, Scene};
 use crate::synth::Synthesiser;
@@ -132,8 +132,8 @@ fn written(scenes: &[(u64, [u64; 2], Scene)]) -> Vec<u8> {
     let dir = tempfile::tempdir().expect("a directory");
     let path = dir.path().join("out.mcap");
     let network = network();
-    let grid = network.output_grid();
-    let voxels: usize = grid.iter().product();
+    let grid = Grid::of(&network);
+    let voxels = grid.voxels();
     let mut writer = LogWriter::create(&path, &network).expect("a log");
     for (stamp, stamps, scene) in scenes {
         let classes: Vec<u8> = (0..voxels).map(|at| (at % 17) as u8).collect();

@@ -6,7 +6,7 @@ use super::pinhole::Pinhole;
 use super::schema::{self, PackedElementField, Schema, Timestamp, Vector2, Vector3, descriptors, numeric};
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::file::replace::Replacement;
-use crate::network::Network;
+use crate::network::{Grid, Network};
 use crate::runtime::session::Occupancy;
 use crate::show::picture::Palette;
 use mcap::records::MessageHeader;
@@ -137,9 +137,10 @@ impl LogWriter {
     }
 
     fn check(&self, occupancy: &Occupancy<'_>) -> Result<()> {
-        let expected = self.network.output_grid();
-        if occupancy.grid != expected {
-            let message = format!("a result of {:?} voxels, the log is of {expected:?}", occupancy.grid);
+        let (found, expected) = (occupancy.grid, Grid::of(&self.network));
+        if found != expected {
+            let says = |grid: Grid| format!("{:?} voxels within {:?} m", grid.size, grid.bounds);
+            let message = format!("a result of {}, the log is of {}", says(found), says(expected));
             return Err(Error::mismatch(message));
         }
         let beyond = |class: &&u8| usize::from(**class) >= self.colours.len();
@@ -214,7 +215,7 @@ impl LogWriter {
 
     fn voxels(&self, stamp: Stamp, occupancy: &Occupancy<'_>) -> Result<schema::VoxelGrid> {
         const CELL: usize = 8;
-        let [nx, ny, nz] = occupancy.grid;
+        let [nx, ny, nz] = occupancy.grid.size;
         let bytes = occupancy.classes.len().checked_mul(CELL).filter(|&bytes| u32::try_from(bytes).is_ok());
         let bytes = bytes.ok_or_else(|| Error::new(ErrorKind::TooLarge, "voxels of more than 4 GiB, expected less"))?;
         let mut data = Vec::with_capacity(bytes);
@@ -248,7 +249,7 @@ impl LogWriter {
     /// Of each column the lowest voxel that is not empty.
     fn ground(&self, stamp: Stamp, occupancy: &Occupancy<'_>) -> schema::Grid {
         const CELL: usize = 12;
-        let [nx, ny, nz] = occupancy.grid;
+        let [nx, ny, nz] = occupancy.grid.size;
         let ([low_x, low_y, low_z], [x, y, z]) = self.frame();
         let mut data = Vec::with_capacity(CELL * nx * ny);
         for row in 0..ny {

@@ -13,6 +13,9 @@ use std::collections::{BTreeMap, BTreeSet};
 const SCALES: &str = "scales";
 const KEEP_F32: &str = "keep_f32";
 
+/// Metadata key of a model whose convolutions use Winograd's minimal filtering where shapes make it worth while.
+const WINOGRAD: &str = "winograd";
+
 /// Everything from which a model's graphs follow.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Form {
@@ -40,12 +43,12 @@ impl Form {
     /// # Errors
     /// Rewrites that keep batch norms, and whatever [`Graph::quantise`] refuses.
     pub(crate) fn integers(network: &Network, rewrites: Rewrites, quantisation: Quantisation) -> Result<Self> {
-        let options = Options { precision: Precision::I8, rewrites };
+        let options = Options { precision: Precision::I8, rewrites: Rewrites { winograd: false, ..rewrites } };
         Self { network: network.clone(), options, quantisation: Some(quantisation) }.checked()
     }
 
     fn checked(self) -> Result<Self> {
-        let Rewrites { batch_norm, projection } = self.options.rewrites;
+        let Rewrites { batch_norm, projection, .. } = self.options.rewrites;
         if projection && !batch_norm {
             return Err(Error::new(ErrorKind::Unsupported, "the projection can only be folded when batch norms are"));
         }
@@ -77,7 +80,13 @@ impl Form {
             "kept" => Ok(false),
             other => Err(wrong(key, other, "folded or kept")),
         };
-        let rewrites = Rewrites { batch_norm: flag("batch_norm")?, projection: flag("projection")? };
+        // A model without the key has direct sums.
+        let winograd = match metadata.get(WINOGRAD).map(String::as_str) {
+            None => false,
+            Some("used") => true,
+            Some(other) => return Err(wrong(WINOGRAD, other, "used or no such key")),
+        };
+        let rewrites = Rewrites { batch_norm: flag("batch_norm")?, projection: flag("projection")?, winograd };
         if rewrites.projection && !rewrites.batch_norm {
             return Err(Error::format("the projection is folded but the batch norms are not"));
         }
@@ -103,6 +112,9 @@ impl Form {
             ("batch_norm".to_owned(), flag(rewrites.batch_norm)),
             ("projection".to_owned(), flag(rewrites.projection)),
         ]);
+        if rewrites.winograd {
+            metadata.insert(WINOGRAD.to_owned(), "used".to_owned());
+        }
         if let Some(Quantisation { keep_f32, scales }) = &self.quantisation {
             metadata.insert(KEEP_F32.to_owned(), serde_json::to_string(keep_f32).unwrap_or_default());
             metadata.insert(SCALES.to_owned(), serde_json::to_string(scales).unwrap_or_default());
@@ -115,9 +127,9 @@ impl Form {
     /// # Errors
     /// Those of [`Graph::quantise`], and a scale that it lacks.
     pub(crate) fn graph(&self, unfolded: bool, results: Results) -> Result<Graph> {
-        let Rewrites { batch_norm, projection } = self.options.rewrites;
-        let projection = projection && (!unfolded || self.quantisation.is_some());
-        let graph = Graph::build(&self.network, results).rewritten(Rewrites { batch_norm, projection });
+        let rewrites = self.options.rewrites;
+        let projection = rewrites.projection && (!unfolded || self.quantisation.is_some());
+        let graph = Graph::build(&self.network, results).rewritten(Rewrites { projection, ..rewrites });
         match &self.quantisation {
             None => Ok(graph),
             Some(quantisation) => graph.quantise(&quantisation.keep_f32, &mut |name| quantisation.scale(name)),

@@ -220,7 +220,7 @@ impl<'a> Conversion<'a> {
 }
 
 /// The bytes of a stored tensor: each value rounded once, to f32, and from there to a narrower type if it is stored in one.
-fn encode(name: &str, part: &Part, values: &[f64], precision: Precision) -> Result<Vec<u8>> {
+pub(super) fn encode(name: &str, part: &Part, values: &[f64], precision: Precision) -> Result<Vec<u8>> {
     let single = |value: f64| {
         let single = value as f32;
         let bad = || Error::format(format!("tensor \"{name}\": folding gives {single}, expected finite numbers"));

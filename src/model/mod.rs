@@ -10,7 +10,10 @@ pub mod import;
 pub mod ranges;
 pub mod seeded;
 pub mod selftest;
+mod transform;
 pub mod unpacked;
+
+pub use transform::use_winograd;
 
 use crate::base::error::{Error, Result};
 use crate::file::container::{Container, Data, Layout, Tensor};

@@ -1,7 +1,7 @@
 //! Sound containers that are no sound models.
 
 use super::*;
-use crate::ErrorKind;
+use crate::base::error::ErrorKind;
 use crate::file::container;
 use crate::graph::parts::MAX_PARTS;
 use crate::graph::{Recipe, Scale};
@@ -87,7 +87,12 @@ fn a_model_that_was_read_needs_no_file() {
 #[test]
 fn models_say_what_they_are() {
     for precision in [Precision::F32, Precision::F16] {
-        for rewrites in [Rewrites::ALL, Rewrites::NONE, Rewrites { projection: false, ..Rewrites::ALL }] {
+        for rewrites in [
+            Rewrites::ALL,
+            Rewrites::NONE,
+            Rewrites { projection: false, ..Rewrites::ALL },
+            Rewrites { winograd: false, ..Rewrites::ALL },
+        ] {
             let options = Options { precision, rewrites };
             let bytes = sound(options);
             let size = bytes.len();
@@ -97,7 +102,7 @@ fn models_say_what_they_are() {
             assert!(model.checksum().is_some());
             let found: Vec<String> = model.tensors().map(|(name, ..)| name).collect();
             let graphs = model.form.graphs().expect("sound");
-            let expected = stored(&graphs).into_iter().flat_map(|(g, o)| {
+            let expected = super::stored(&graphs).into_iter().flat_map(|(g, o)| {
                 let operation = &graphs[g].operations[o];
                 parts(&graphs[g], operation).into_iter().map(|part| format!("{}.{}", operation.name, part.suffix))
             });
@@ -132,6 +137,7 @@ fn metadata_that_is_wrong_is_named() {
     refused(set("format", "pt"), "found \"pt\"");
     refused(set("precision", "f64"), "found \"f64\", expected f32, f16 or int8");
     refused(set("projection", "yes"), "found \"yes\", expected folded or kept");
+    refused(set("winograd", "kept"), "found \"kept\", expected used or no such key");
     refused(set("batch_norm", "kept"), "the batch norms are not");
     refused(set("network", "{}"), "network JSON: missing field");
     let deeper = Network { depths: [2, 1, 1, 1], ..network() }.to_json();
@@ -318,16 +324,22 @@ fn a_model_gives_its_weights_back() {
 #[test]
 fn stored_sizes_of_known_operations() {
     let network = Network::built_in("nuscenes-200").expect("built in");
-    let graph = Graph::build(&network, Results::default()).rewritten(Rewrites::ALL);
-    let lens = |name: &str| {
+    let graph = |winograd| Graph::build(&network, Results::default()).rewritten(Rewrites { winograd, ..Rewrites::ALL });
+    let (direct, filtered) = (graph(false), graph(true));
+    let lens_in = |graph: &Graph, name: &str| {
         let operation = graph.operations.iter().find(|o| o.name == name).expect(name);
-        parts(&graph, operation).iter().map(|p| p.len).collect::<Vec<_>>()
+        parts(graph, operation).iter().map(|p| p.len).collect::<Vec<_>>()
     };
+    let lens = |name: &str| lens_in(&direct, name);
     assert_eq!(lens("img_backbone.conv1"), [7 * 7 * 3 * 64, 64]);
     // 27 offsets and mask logits fill two panels of 16.
     assert_eq!(lens("img_backbone.layer3.0.conv2.conv_offset"), [9 * 256 * 32, 32]);
     // 64 channels for the volume and 64 for the plane.
     assert_eq!(lens("img_neck.fpn_convs.0.conv.projected"), [9 * 512 * 128, 128]);
+    // Six by six points in place of nine taps; in a volume with three taps along z.
+    assert_eq!(lens_in(&filtered, "img_neck.fpn_convs.0.conv.projected"), [36 * 512 * 128, 128]);
+    assert_eq!(lens_in(&filtered, "view_transformer.refine_lvl0.0"), [36 * 3 * 32 * 32, 32]);
+    assert_eq!(lens_in(&filtered, "img_backbone.conv1"), lens("img_backbone.conv1"));
     assert_eq!(lens("view_transformer.up_sample1.0"), [8 * 8 * 64 * 32, 32]);
     assert_eq!(lens("view_transformer.imvts.0.combine_coeff"), [64, 16]);
     // 17 classes fill two panels.

@@ -83,11 +83,17 @@ impl<'a> Unpacked<'a> {
     /// The weights of `model`.
     ///
     /// # Errors
-    /// [`ErrorKind::Unsupported`] for a model of int8, whose weights are rounded, and for one that keeps its batch norms.
+    /// [`ErrorKind::Unsupported`] for a model of int8, whose weights are rounded, one whose weights are transformed, and one that
+    /// keeps its batch norms.
     pub fn new(model: &'a Model) -> Result<Self> {
         let options = model.options();
         if options.precision == Precision::I8 || !options.rewrites.batch_norm {
             let message = "a model of int8 or with batch norms of its own, expected one of f32 or f16 with folded ones";
+            return Err(Error::new(ErrorKind::Unsupported, message));
+        }
+        if options.rewrites.winograd {
+            let message = "a model whose weights are transformed for Winograd's minimal filtering, expected one that was \
+                           imported with --exact";
             return Err(Error::new(ErrorKind::Unsupported, message));
         }
         let graph = model.graph(true, crate::graph::Results::ALL);

@@ -143,7 +143,7 @@ impl Network {
                 ..nuscenes_256
             }),
             "edge" => Some(Network {
-                depths: [2, 2, 3, 1],
+                depths: [2, 2, 3, 2],
                 width: 32,
                 dcn: [false; 4],
                 block: Block::Basic,
@@ -152,7 +152,7 @@ impl Network {
                 key_dims: [4, 6, 8],
                 // The ground, 1.84 m below the lidar, passes through the middle of its voxels.
                 bounds: [[-50.0, 50.0], [-50.0, 50.0], [-5.3, 2.7]],
-                image: [128, 352],
+                image: [192, 544],
                 grids: [[52, 52, 4], [26, 26, 2], [13, 13, 1]],
                 ..nuscenes_200
             }),

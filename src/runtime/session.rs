@@ -19,7 +19,7 @@ use crate::base::threads::Threads;
 use crate::graph::{Elements, Graph, Operation};
 use crate::image::ImageView;
 use crate::model::{Model, PartRef};
-use crate::network::Network;
+use crate::network::{Grid, Network};
 use crate::rig::{Csr, Level, Rig};
 use crate::runtime::arena::Arena;
 use crate::runtime::executor::Executor;
@@ -285,8 +285,7 @@ impl Session {
 
     /// The last complete result; none before the first frame. It stays as it is while [`Session::step`] works on the next.
     pub fn occupancy(&self) -> Option<Occupancy<'_>> {
-        let grid = self.model.network().output_grid();
-        (self.frame.any_complete() && !self.taken_out).then(|| self.front.occupancy(grid))
+        (self.frame.any_complete() && !self.taken_out).then(|| self.front.occupancy(Grid::of(self.model.network())))
     }
 
     /// Takes the last complete result out of the session, without copying it; none before the first frame, or where it was
@@ -306,7 +305,7 @@ impl Session {
         };
         let output = std::mem::replace(&mut self.front, next);
         self.taken_out = true;
-        Ok(Some(OwnedOccupancy::new(self.model.network().output_grid(), output)))
+        Ok(Some(OwnedOccupancy::new(Grid::of(self.model.network()), output)))
     }
 
     /// The longest time that one slice took so far, and the operation that it was a part of. Slices of [`Session::run`]

@@ -72,7 +72,7 @@ struct Data<'a> {
     truth: Option<Layer<'a>>,
     /// u16 per voxel.
     support: Option<String>,
-    cameras: Vec<Camera<'a>>,
+    cameras: Vec<PageCamera<'a>>,
 }
 
 #[derive(Serialize)]
@@ -89,7 +89,7 @@ struct Layer<'a> {
 }
 
 #[derive(Serialize)]
-struct Camera<'a> {
+struct PageCamera<'a> {
     name: &'a str,
     /// Pixels of the original, for which the matrix is.
     width: usize,
@@ -216,7 +216,7 @@ fn base64(bytes: &[u8]) -> String {
     text
 }
 
-fn cameras(scene: &Scene) -> Result<Vec<Camera<'_>>> {
+fn cameras(scene: &Scene) -> Result<Vec<PageCamera<'_>>> {
     let (names, images, matrices) = (scene.names.len(), scene.images.len(), scene.lidar2img.len());
     if names != images || matrices != images {
         let message = format!("scene of {names} names, {images} images, {matrices} matrices, expected as many of each");
@@ -229,7 +229,7 @@ fn cameras(scene: &Scene) -> Result<Vec<Camera<'_>>> {
                 return Err(Error::format(format!("camera {name}: lidar2img is not finite, expected finite numbers")));
             }
             let Image { width, height, .. } = *image;
-            Ok(Camera { name, width, height, lidar2img, image: jpeg(name, image)? })
+            Ok(PageCamera { name, width, height, lidar2img, image: jpeg(name, image)? })
         })
         .collect()
 }

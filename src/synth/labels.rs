@@ -22,7 +22,7 @@ const SMALL_CLASSES: [u8; 5] =
     [class::BARRIER, class::BICYCLE, class::MOTORCYCLE, class::PEDESTRIAN, class::TRAFFIC_CONE];
 
 /// The output grid of a network, in vehicle coordinates.
-pub(super) struct Grid {
+pub(super) struct VehicleGrid {
     size: [usize; 3],
     low: Vec3,
     edge: Vec3,
@@ -30,7 +30,7 @@ pub(super) struct Grid {
     forward: Vec2,
 }
 
-impl Grid {
+impl VehicleGrid {
     pub(super) fn new(network: &Network, forward: [f32; 2]) -> Self {
         let low = Vec3::from_array(std::array::from_fn(|a| network.bounds[a][0]));
         let edge = Vec3::from_array(network.voxel_size());
@@ -65,7 +65,7 @@ struct Fill {
 ///
 /// In each voxel `POINTS`^3 points are asked. Solids are filled. Thin things are taken to be as thick as the points are
 /// apart, so that none slips through.
-pub(super) fn voxels(world: &World, grid: &Grid) -> Vec<u8> {
+pub(super) fn voxels(world: &World, grid: &VehicleGrid) -> Vec<u8> {
     let mut classes = vec![0u8; grid.voxels()];
     ground(world, grid, &mut classes);
     let mut fills = Vec::new();
@@ -91,7 +91,7 @@ pub(super) fn voxels(world: &World, grid: &Grid) -> Vec<u8> {
 }
 
 /// The surface of the ground: in every column of points the voxel that it passes through, by majority.
-fn ground(world: &World, grid: &Grid, classes: &mut [u8]) {
+fn ground(world: &World, grid: &VehicleGrid, classes: &mut [u8]) {
     let [nx, ny, nz] = grid.size;
     let step = grid.edge / POINTS as f32;
     for x in 0..nx {
@@ -123,7 +123,7 @@ fn ground(world: &World, grid: &Grid, classes: &mut [u8]) {
 }
 
 /// Appends the points that an object fills.
-fn fill(world: &World, grid: &Grid, object: &Object, fills: &mut Vec<Fill>) {
+fn fill(world: &World, grid: &VehicleGrid, object: &Object, fills: &mut Vec<Fill>) {
     let step = grid.edge / POINTS as f32;
     let thick = step.max_element();
     let [nx, ny, nz] = grid.size;
@@ -181,7 +181,7 @@ fn fill(world: &World, grid: &Grid, object: &Object, fills: &mut Vec<Fill>) {
 const LANES: usize = 16;
 
 /// Per voxel whether a camera sees it: whether the ray of one of its pixels goes through it or ends on it.
-pub(super) fn visible(grid: &Grid, cameras: &[Pinhole], views: &[CameraView]) -> Vec<u8> {
+pub(super) fn visible(grid: &VehicleGrid, cameras: &[Pinhole], views: &[CameraView]) -> Vec<u8> {
     let mut seen = vec![0u8; grid.voxels()];
     for (camera, view) in cameras.iter().zip(views) {
         let [height, width] = camera.size;
@@ -204,7 +204,7 @@ pub(super) fn visible(grid: &Grid, cameras: &[Pinhole], views: &[CameraView]) ->
 
 /// Rays from one place on their way through a grid, lane by lane.
 struct Walks<'a> {
-    grid: &'a Grid,
+    grid: &'a VehicleGrid,
     /// In voxels, as everything here.
     origin: Vec3,
     count: usize,
@@ -225,7 +225,7 @@ struct Lanes {
 }
 
 impl<'a> Walks<'a> {
-    fn new(grid: &'a Grid, origin: Vec3) -> Self {
+    fn new(grid: &'a VehicleGrid, origin: Vec3) -> Self {
         let origin = (origin - grid.low) / grid.edge;
         Self { grid, origin, count: 0, far: [0.0; LANES], voxel: [0; LANES], axes: [Lanes::default(); 3] }
     }

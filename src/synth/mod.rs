@@ -8,10 +8,10 @@
 //! voxel, so that a seed gives the same bytes on every machine. Frames are independent of each other.
 
 mod camera;
+mod culling;
 mod labels;
 mod objects;
 mod render;
-mod sight;
 mod solid;
 mod street;
 mod texture;
@@ -28,7 +28,7 @@ use crate::base::random::Random;
 use crate::network::Network;
 use crate::scene::{Scene, forward_of};
 use camera::Pinhole;
-use labels::Grid;
+use labels::VehicleGrid;
 use render::Light;
 use world::World;
 
@@ -138,7 +138,7 @@ impl Synthesiser {
         let shadows = world.shadows(&light);
         let view = |(n, camera)| world.view(&light, shadows.as_ref(), camera, noise(n));
         let views: Vec<CameraView> = self.cameras.iter().enumerate().map(view).collect();
-        let grid = Grid::new(&self.network, self.forward);
+        let grid = VehicleGrid::new(&self.network, self.forward);
         let labels = labels::voxels(&world, &grid);
         let visible = labels::visible(&grid, &self.cameras, &views);
         let mut frame = Frame {

@@ -1,7 +1,7 @@
 //! What a camera sees of a world: colours, and per pixel the class and the distance.
 
 use super::camera::Pinhole;
-use super::sight::{Shadows, Sight};
+use super::culling::{Culling, Shadows};
 use super::solid::Part;
 use super::street::class;
 use super::texture::{pick, smooth};
@@ -134,10 +134,10 @@ impl World {
         self.ego.0 + Vec3::Z * LIDAR_HEIGHT + self.turned(v)
     }
 
-    fn sample(&self, light: &Light, shadows: Option<&Shadows>, sight: &mut Sight, ray: Vec3) -> Sample {
-        let origin = sight.origin();
+    fn sample(&self, light: &Light, shadows: Option<&Shadows>, culling: &mut Culling, ray: Vec3) -> Sample {
+        let origin = culling.origin();
         let ground = self.street.hit(origin, ray, HORIZON);
-        let object = sight.hit(ray, ground.unwrap_or(HORIZON));
+        let object = culling.hit(ray, ground.unwrap_or(HORIZON));
         let (distance, normal, base, class, surface) = match (object, ground) {
             (Some((number, part, hit)), _) => {
                 let object = &self.objects[number];
@@ -177,22 +177,22 @@ impl World {
     /// What a camera sees. `seed` is of the sensor's noise.
     pub(super) fn view(&self, light: &Light, shadows: Option<&Shadows>, camera: &Pinhole, seed: u64) -> CameraView {
         let [height, width] = camera.size;
-        let cast = |sight: &mut Sight, u: f64, v: f64| {
+        let cast = |culling: &mut Culling, u: f64, v: f64| {
             let ray = self.turned(camera.ray(u, v).as_vec3());
             let length = ray.length();
-            (self.sample(light, shadows, sight, ray / length), length)
+            (self.sample(light, shadows, culling, ray / length), length)
         };
-        let mut sight = Sight::new(self, camera);
+        let mut culling = Culling::new(self, camera);
         let (mut classes, mut depths) = (vec![SKY; height * width], vec![f32::INFINITY; height * width]);
         let (mut surfaces, mut colours) = (vec![0u32; height * width], vec![Vec3::ZERO; height * width]);
-        sight.pixels(|sight, u, v| {
-            let (sample, length) = cast(sight, u as f64, v as f64);
+        culling.pixels(|culling, u, v| {
+            let (sample, length) = cast(culling, u as f64, v as f64);
             let pixel = v * width + u;
             (classes[pixel], depths[pixel]) = (sample.class, sample.distance / length);
             (surfaces[pixel], colours[pixel]) = (sample.surface, sample.colour);
         });
         if width <= SMALL {
-            sight.pixels(|sight, u, v| {
+            culling.pixels(|culling, u, v| {
                 let pixel = v * width + u;
                 let other = |near: bool, at: usize| near && surfaces[at] != surfaces[pixel];
                 let edge = other(u > 0, pixel.wrapping_sub(1))
@@ -201,7 +201,7 @@ impl World {
                     || other(v + 1 < height, pixel + width);
                 if edge {
                     for (du, dv) in [(0.33, 0.12), (-0.12, 0.33), (-0.33, -0.12), (0.12, -0.33)] {
-                        colours[pixel] += cast(sight, u as f64 + du, v as f64 + dv).0.colour;
+                        colours[pixel] += cast(culling, u as f64 + du, v as f64 + dv).0.colour;
                     }
                     colours[pixel] *= 0.2;
                 }

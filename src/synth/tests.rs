@@ -213,11 +213,11 @@ fn files_are_scenes_and_hold_what_the_frame_has() {
     let synthesiser = Synthesiser::new(&network).expect("17 classes");
     let frame = synthesiser.frame(4);
     let path = directory.path().join(set_file(4));
-    frame.save_tensors(&path, network.output_grid(), true).expect("written");
+    frame.save_tensors(&path, crate::network::Grid::of(&network), true).expect("written");
     let scene = Scene::open(&path).expect("a scene");
     assert_eq!((&scene.images, &scene.lidar2img), (&frame.scene.images, &frame.scene.lidar2img));
     let place = directory.path().join("scene");
-    frame.save_scene(&place, network.output_grid()).expect("written");
+    frame.save_scene(&place, crate::network::Grid::of(&network)).expect("written");
     assert_eq!(Scene::open(&place).expect("a scene"), frame.scene);
     let arrays = read_npz(&place.join("labels.npz")).expect("arrays");
     assert_eq!(arrays[0].elements, OwnedElements::U8(frame.labels.clone()));

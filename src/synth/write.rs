@@ -4,6 +4,7 @@ use super::{CLASSES, Frame, Synthesiser};
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::file::container::{self, Data, Layout, Tensor};
 use crate::file::replace::replace_file;
+use crate::network::Grid;
 use half::f16;
 use safetensors::Dtype;
 use std::collections::BTreeMap;
@@ -24,7 +25,7 @@ impl Frame {
     ///
     /// # Errors
     /// [`ErrorKind::Io`] if the file cannot be written.
-    pub fn save_tensors(&self, path: &Path, grid: [usize; 3], pixels: bool) -> Result<()> {
+    pub fn save_tensors(&self, path: &Path, grid: Grid, pixels: bool) -> Result<()> {
         let count = self.scene.images.len();
         let [height, width] = self.scene.images.first().map_or([0, 0], |i| [i.height, i.width]);
         let tensor = |name: &str, dtype, shape: &[usize], bytes: Vec<u8>| Tensor {
@@ -38,8 +39,8 @@ impl Frame {
         let mut tensors = vec![
             tensor("images", Dtype::U8, &[count, height, width, 3], images),
             tensor("lidar2img", Dtype::F32, &[count, 4, 4], matrices),
-            tensor("labels", Dtype::U8, &grid, self.labels.clone()),
-            tensor("visible", Dtype::U8, &grid, self.visible.clone()),
+            tensor("labels", Dtype::U8, &grid.size, self.labels.clone()),
+            tensor("visible", Dtype::U8, &grid.size, self.visible.clone()),
         ];
         if pixels {
             let shape = [count, height, width];
@@ -56,15 +57,15 @@ impl Frame {
     ///
     /// # Errors
     /// [`ErrorKind::Io`] if the directory or a file cannot be written.
-    pub fn save_scene(&self, directory: &Path, grid: [usize; 3]) -> Result<()> {
+    pub fn save_scene(&self, directory: &Path, grid: Grid) -> Result<()> {
         use crate::file::npz::{Array, Elements};
         self.scene.save_stamped(directory, Some(self.stamp))?;
-        let array = |name, bytes| Array { name, shape: &grid, elements: Elements::U8(bytes) };
+        let array = |name, bytes| Array { name, shape: &grid.size, elements: Elements::U8(bytes) };
         crate::file::npz::write_npz(
             &directory.join("labels.npz"),
             &[array("classes", &self.labels[..]), array("visible", &self.visible[..])],
         )?;
-        replace_file(&directory.join("labels.npy"), |out| write_rows(out, &self.labels, grid))
+        replace_file(&directory.join("labels.npy"), |out| write_rows(out, &self.labels, grid.size))
     }
 }
 

@@ -28,6 +28,8 @@ struct Files {
     directory: tempfile::TempDir,
     images: Vec<PathBuf>,
     size: [usize; 2],
+    /// Bytes of a session without logits, and of one that keeps them.
+    memory: [usize; 2],
     digest: String,
     logits_digest: String,
 }
@@ -52,6 +54,8 @@ impl Files {
         std::fs::write(path("matrices"), matrices).unwrap();
         std::fs::write(path("images"), images.iter().flat_map(|i| i.pixels).copied().collect::<Vec<u8>>()).unwrap();
         let options = SessionOptions { logits: true, ..SessionOptions::default() };
+        let memory = [&SessionOptions::default(), &options]
+            .map(|options| Session::memory(&model, network.cameras, options).unwrap().total());
         let mut session = Session::new(model, rig, &options).unwrap();
         let result = session.run(&images).unwrap();
         Self {
@@ -59,6 +63,7 @@ impl Files {
             logits_digest: format!("of logits {:016x}", result.logits_digest().unwrap()),
             images: images.iter().enumerate().map(|(i, view)| ppm(&path(&format!("{i}.ppm")), view)).collect(),
             size: [images[0].height, images[0].width],
+            memory,
             directory,
         }
     }
@@ -78,6 +83,7 @@ impl Files {
         command
             .args(self.size.map(|side| side.to_string()))
             .args(["matrices", "faulty", "mute"].map(|name| self.path(name)))
+            .args(self.memory.map(|bytes| bytes.to_string()))
     }
 
     fn assert_digest(&self, command: &mut Command) -> String {

@@ -129,8 +129,8 @@ fn weights_that_cannot_be_used_are_named() {
             "variance",
         ),
         (
-            "view_transformer.up_sample1.0.weight",
-            &|t| t.get_mut("view_transformer.up_sample1.0.weight").unwrap().0.swap(0, 1),
+            "view_transformer.up_sample2.0.weight",
+            &|t| t.get_mut("view_transformer.up_sample2.0.weight").unwrap().0.swap(0, 1),
             "expects",
         ),
         (

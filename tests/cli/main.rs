@@ -103,7 +103,13 @@ impl Source for Recorder {
 type Tensors = BTreeMap<String, (Vec<usize>, Vec<f32>)>;
 
 fn network() -> Network {
-    Network { image: [32, 64], grids: [[8, 12, 4], [4, 6, 2], [2, 3, 1]], depths: [1; 4], ..small::network() }
+    Network {
+        image: [32, 64],
+        channels: [16, 16, 24, 32],
+        grids: [[8, 12, 4], [4, 6, 2], [2, 3, 1]],
+        depths: [1; 4],
+        ..small::network()
+    }
 }
 
 /// A directory with a network, its checkpoint in both formats, a scene; and, once asked for, a model and a rig.

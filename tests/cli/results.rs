@@ -102,7 +102,7 @@ fn the_demo_needs_no_other_file() {
     let directory = place.path().join("a/b").to_str().unwrap().to_owned();
     let told = done(&["demo", "-o", &directory, "--threads", "2"]);
     let digest = told.split("digest ").nth(1).unwrap().split_whitespace().next().unwrap();
-    assert_eq!(digest, "401ca41a0e1d4514", "the same on every machine, until the network or the street is another");
+    assert_eq!(digest, "8c5f910740f99366", "the same on every machine, until the network or the street is another");
     let file = |name: &str| format!("{directory}/{name}");
     let (model, scene, out) = (file("model.safetensors"), file("scene"), file("again.npz"));
     let again = done(&["run", "--model", &model, &scene, "-o", &out]);
@@ -213,6 +213,35 @@ fn an_imported_model_tests_the_machine() {
     let [network, weights, plain] = ["network.json", "weights.pth", "plain"].map(|f| place.text(f));
     done(&["import", &weights, "--network", &network, "-o", &plain, "--no-self-test"]);
     assert!(refused(&plain, &["selftest", &plain]).contains("no self-test"));
+}
+
+#[test]
+fn direct_sums_are_kept_or_transformed() {
+    let place = Place::ready();
+    let [network, weights, scene, exact, model] =
+        ["network.json", "weights.pth", "scene", "exact", "transformed"].map(|f| place.text(f));
+    done(&["import", &weights, "--network", &network, "--exact", "-o", &exact]);
+    done(&["import", &exact, "-o", &model]);
+    let told = |model: &str| -> Value { serde_json::from_str(&done(&["inspect", model, "--json"])).unwrap() };
+    let [kept, used] = [&exact, &model].map(|model| told(model));
+    assert_eq!((&kept["winograd_used"], &used["winograd_used"]), (&json!(false), &json!(true)));
+    assert_eq!(
+        (&kept["executed_multiply_adds"], &kept["multiply_adds"]),
+        (&used["multiply_adds"], &used["multiply_adds"])
+    );
+    assert!(used["executed_multiply_adds"].as_u64() < used["multiply_adds"].as_u64());
+    assert!(done(&["inspect", &model, "--operations"]).contains("conv3d F(4,3)"));
+    assert!(!done(&["inspect", &exact, "--operations"]).contains("F(4,3)"));
+    assert!(done(&["selftest", &model]).contains("give what they must"));
+    let logits = |model: &str| -> Value {
+        let arguments = ["run", "--model", model, &scene, "-o", &place.text("o.npz"), "--logits", "--json"];
+        serde_json::from_str::<Value>(&done(&arguments)).unwrap()["logits_digest"].clone()
+    };
+    assert_ne!(logits(&exact), logits(&model), "other roundings");
+    assert!(refused(&model, &["import", &model, "-o", &exact]).contains("already"));
+    let output = voxcast(&["import", &weights, "-o", &place.text("none")]);
+    assert_eq!((output.status.code(), place.path("none").exists()), (Some(2), false));
+    assert!(text(&output.stderr).contains("--network, unless the checkpoint is a model"), "{}", text(&output.stderr));
 }
 
 #[test]

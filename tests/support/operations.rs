@@ -4,6 +4,15 @@
 use super::named;
 use voxcast::random::Random;
 
+/// Taps of a deformable convolution.
+pub(crate) const TAPS: usize = 3 * 3;
+
+/// Channels of its offsets: down and right of each tap, then each tap's mask.
+pub(crate) const OFFSETS: usize = 3 * TAPS;
+
+/// Taps of the convolution on an attention head's queries.
+pub(crate) const QUERY_TAPS: usize = 5 * 5;
+
 /// One operation on one shape.
 #[derive(Clone, Debug)]
 pub(crate) struct Case {
@@ -137,7 +146,7 @@ pub(crate) fn table() -> Vec<Case> {
         ("conv.point", Kind::Conv(conv([1, 5, 7], 13, 17, [1; 3]))),
         ("conv.one_pixel", Kind::Conv(conv([1; 3], 5, 3, IMAGE))),
         ("conv.image", Kind::Conv(conv([1, 9, 11], 7, 33, IMAGE))),
-        ("conv.offsets", Kind::Conv(conv([1, 6, 5], 8, 27, IMAGE))),
+        ("conv.offsets", Kind::Conv(conv([1, 6, 5], 8, OFFSETS, IMAGE))),
         ("conv.stem", Kind::Conv(after(strided(conv([1, 18, 21], 3, 20, [1, 7, 7]), 2), After::Relu))),
         ("conv.stride", Kind::Conv(strided(conv([1, 9, 8], 6, 16, IMAGE), 2))),
         ("conv.stride_point", Kind::Conv(strided(conv([1, 9, 8], 6, 16, [1; 3]), 2))),
@@ -215,7 +224,7 @@ impl Case {
         (0..len).map(|_| random.below(256) as u8).collect()
     }
 
-    /// Offsets of a deformable convolution, 27 channels of `positions`: some are whole pixels, some land just on the
+    /// Offsets of a deformable convolution, [`OFFSETS`] channels of `positions`: some are whole pixels, some land just on the
     /// border of the image, the rest are anywhere within `reach`. Then the mask's logits.
     pub(crate) fn offsets(&self, positions: usize, reach: f32) -> Vec<f32> {
         let mut random = self.random("offsets");
@@ -224,8 +233,8 @@ impl Case {
             1 => random.range(-reach, reach).round() + 0.5,
             _ => random.range(-reach, reach),
         };
-        let mut values: Vec<f32> = (0..18 * positions).map(|_| offset()).collect();
-        values.extend(self.numbers("mask", 9 * positions));
+        let mut values: Vec<f32> = (0..2 * TAPS * positions).map(|_| offset()).collect();
+        values.extend(self.numbers("mask", TAPS * positions));
         values
     }
 

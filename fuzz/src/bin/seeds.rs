@@ -26,6 +26,7 @@ fn main() -> std::io::Result<()> {
         ("npz", archives()),
         ("rig", rigs()),
         ("scene", scenes()),
+        ("uniocc", uniocc()),
     ];
     all.extend(DRAWN.map(|target| (target, drawn())));
     for (target, seeds) in all {
@@ -37,6 +38,21 @@ fn main() -> std::io::Result<()> {
         println!("{}: {} seeds", dir.display(), seeds.len());
     }
     Ok(())
+}
+
+/// A list of scenes, and cameras with matrices as rows and as arrays.
+fn uniocc() -> Vec<(String, Vec<u8>)> {
+    let p = || pth::Pickle::new(4);
+    let scenes = p().raw(b"](}(").text("occ_in_scene_paths").raw(b"](").text("a.npz").raw(b"eue").stop();
+    let row = |p: pth::Pickle, row: &[i64]| row.iter().fold(p.raw(b"]("), |p, &n| p.int(n)).raw(b"e");
+    let camera = p().raw(b"](}(").text("name").text("C").text("filename").text("a.png").text("intrinsics").raw(b"](");
+    let camera = [[9, 0, 4], [0, 9, 4], [0, 0, 1]].iter().fold(camera, |p, numbers| row(p, numbers));
+    let camera = camera.raw(b"e").text("extrinsics").global("numpy.core.multiarray", "_reconstruct");
+    let camera = camera.raw(b"(").global("numpy", "ndarray").ints(&[0]).raw(b"C\x01btR(").int(1).ints(&[4, 4]);
+    let camera =
+        camera.global("numpy", "dtype").raw(b"(").text("u1").raw(b"\x89\x88tR(").int(3).text("|").raw(b"NNNtb");
+    let camera = camera.raw(b"\x89C\x10\x01\0\0\0\0\x01\0\0\0\0\x01\0\0\0\0\x01tbue").stop();
+    vec![("scenes".to_owned(), scenes), ("cameras".to_owned(), camera)]
 }
 
 /// A log of one frame.
@@ -54,7 +70,7 @@ fn logs() -> Vec<(String, Vec<u8>)> {
     let mut log = LogWriter::create(&path, &network).expect("a log");
     let (classes, support) = ([1; 512], [1; 512]);
     let occupancy = voxcast::Occupancy {
-        grid: [8; 3],
+        grid: voxcast::network::Grid::of(&network),
         classes: &classes,
         logits: None,
         support: &support,

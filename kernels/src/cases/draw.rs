@@ -26,6 +26,9 @@ const SPECIAL: [f32; 10] = [
     -1.0,
 ];
 
+/// The mode of values of order one.
+const ORDINARY: u8 = 4;
+
 /// Bytes that are read as shapes and values.
 pub struct Draw {
     bytes: vec::IntoIter<u8>,
@@ -47,6 +50,11 @@ impl Draw {
         let mut draw = Self { bytes: vec![].into_iter(), state: seed, mode: 0 };
         let bytes: Vec<u8> = (0..64).map(|_| draw.bits() as u8).collect();
         Self { mode: draw.bits() as u8 % 4, bytes: bytes.into_iter(), ..draw }
+    }
+
+    /// As [`Draw::seeded`], but all values are between -1 and 1, so that sums can be compared with a tolerance.
+    pub fn ordinary(seed: u64) -> Self {
+        Self { mode: ORDINARY, ..Self::seeded(seed) }
     }
 
     /// splitmix64.
@@ -87,12 +95,12 @@ impl Draw {
     /// A value: one in four is taken from the bytes as it is, as long as there are any.
     pub fn value(&mut self) -> f32 {
         let bits = self.bits();
-        if bits.is_multiple_of(4) && self.bytes.len() >= 4 {
+        if self.mode != ORDINARY && bits.is_multiple_of(4) && self.bytes.len() >= 4 {
             return f32::from_le_bytes([self.byte(), self.byte(), self.byte(), self.byte()]);
         }
         let unit = (bits >> 40) as f32 / (1 << 23) as f32 - 1.0;
         match self.mode {
-            0 => unit,
+            0 | ORDINARY => unit,
             1 if (bits >> 8).is_multiple_of(16) => SPECIAL[(bits >> 16) as usize % SPECIAL.len()],
             1 => unit,
             2 => (unit * 4.0).round(),

@@ -142,7 +142,10 @@ where
         let mut k = 0;
         for piece in 0..block.left.pieces() {
             let len = block.left.len(piece);
-            let left = core::array::from_fn(|r| block.left.row(piece, first + r));
+            let mut left = [core::ptr::null(); N];
+            for (r, left) in left.iter_mut().enumerate() {
+                *left = block.left.row(piece, first + r);
+            }
             let panels = panels.map(|w| &w[k * LANES..(k + len) * LANES]);
             // SAFETY: `Left` promises that these pointers are good for `len` elements each.
             sums = unsafe { arithmetic.multiply(s, column, left, panels, len, sums) };

@@ -177,13 +177,17 @@ impl Source for DeformConv2dI8<'_> {
 /// The sample's channels from those of its corners.
 #[inline(always)]
 fn blend<S: Simd>(s: S, corners: [&[i8]; 4], weights: [i32; 4], out: &mut [i8]) {
-    let weights = weights.map(|w| s.splat_int(w.cast_unsigned()));
     let half = s.splat_int(1 << (WEIGHT - 1));
-    for (i, out) in out.chunks_mut(LANES).enumerate() {
+    let mut factors = [half; 4];
+    for i in 0..4 {
+        factors[i] = s.splat_int(weights[i].cast_unsigned());
+    }
+    for (at, out) in out.chunks_mut(LANES).enumerate() {
+        let here = at * LANES..at * LANES + out.len();
         let mut sum = half;
-        for (corner, weight) in corners.iter().zip(weights) {
-            let x = s.bytes_to_int(s.load_bytes_part(&corner[i * LANES..][..out.len()]));
-            sum = s.add_int(sum, s.mul_short(x, weight));
+        for i in 0..4 {
+            let x = s.bytes_to_int(s.load_bytes_part(&corners[i][here.clone()]));
+            sum = s.add_int(sum, s.mul_short(x, factors[i]));
         }
         s.store_bytes_part(out, s.quantised(s.shift_right_signed(sum, WEIGHT), false));
     }

@@ -277,10 +277,7 @@ pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{
-        Fill, Rng, assert_close, assert_lively, assert_order_shows, assert_same_bits, pad_rows, reverse_rows,
-    };
-    use proptest::prelude::*;
+    use crate::testing::{Fill, Rng, assert_lively, assert_order_shows, assert_same_bits, pad_rows, reverse_rows};
 
     struct Case {
         shape: [usize; 3],
@@ -373,21 +370,6 @@ mod tests {
         }
     }
 
-    proptest! {
-        #[test]
-        fn any_shape_gives_the_scalar_bits(
-            h in 1usize..6, w in 1usize..14, c in 1usize..40, half in 0usize..4, residual: bool, seed: u64,
-        ) {
-            let case = Case::new([h, w, c], 2 * half + 1, residual, seed, Rng::fill_of(seed));
-            let want = case.all(Isa::Scalar);
-            for isa in Isa::available() {
-                assert_same_bits(&case.all(isa), &want, "whole");
-                let split = h / 2;
-                assert_same_bits(&[case.rows(isa, 0..split), case.rows(isa, split..h)].concat(), &want, "split");
-            }
-        }
-    }
-
     #[test]
     fn the_order_of_a_chain_shows() {
         for (shape, kernel) in SHAPES.into_iter().filter(|(shape, kernel)| *kernel > 1 && shape[0] > 1) {
@@ -399,33 +381,6 @@ mod tests {
             case.input = reverse_rows(&case.input, c);
             case.weights = reverse_rows(&case.weights, c.next_multiple_of(LANES));
             assert_order_shows(&reverse_rows(&case.all(Isa::Scalar), c), &want, &format!("{shape:?}, kernel {kernel}"));
-        }
-    }
-
-    #[test]
-    fn the_scalar_code_agrees_with_f64() {
-        for (shape, kernel) in SHAPES {
-            let mut case = Case::new(shape, kernel, true, 3, Rng::ordinary);
-            let [h, w, c] = shape;
-            case.weights = Rng::new(4).ordinary(case.weights.len());
-            case.bias = Rng::new(5).ordinary(case.bias.len());
-            let half = kernel as isize / 2;
-            let want: Vec<f64> = (0..h * w * c)
-                .map(|i| {
-                    let (y, x, ch) = ((i / (w * c)) as isize, (i / c % w) as isize, i % c);
-                    let mut sum = f64::from(case.bias[ch]) + f64::from(case.input[i]);
-                    for (dy, dx) in (-half..=half).flat_map(|dy| (-half..=half).map(move |dx| (dy, dx))) {
-                        if (0..h as isize).contains(&(y + dy)) && (0..w as isize).contains(&(x + dx)) {
-                            let at = ((y + dy) as usize * w + (x + dx) as usize) * c + ch;
-                            let tap = ((dy + half) * kernel as isize + dx + half) as usize;
-                            let weight = case.weights[tap * c.next_multiple_of(LANES) + ch];
-                            sum += f64::from(case.input[at]) * f64::from(weight);
-                        }
-                    }
-                    sum
-                })
-                .collect();
-            assert_close(&case.all(Isa::Scalar), &want, 4e-6, &format!("{shape:?}"));
         }
     }
 

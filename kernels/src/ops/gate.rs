@@ -110,10 +110,7 @@ pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{
-        Fill, Rng, assert_close, assert_lively, assert_order_shows, assert_same_bits, pad_rows, reverse_columns,
-    };
-    use proptest::prelude::*;
+    use crate::testing::{Fill, Rng, assert_lively, assert_order_shows, assert_same_bits, pad_rows, reverse_columns};
 
     struct Case {
         shape: [usize; 3],
@@ -185,23 +182,6 @@ mod tests {
         x
     }
 
-    proptest! {
-        #[test]
-        fn any_shape_gives_the_scalar_bits(columns in 0usize..7, depth in 1usize..20, channels in 1usize..70, seed: u64) {
-            let case = Case::new([columns, depth, channels], seed, Rng::fill_of(seed));
-            let want = case.all(Isa::Scalar);
-            for isa in Isa::available() {
-                assert_same_bits(&case.all(isa), &want, "whole");
-                let mut split = case.volume.clone();
-                let at = columns / 2 * channels;
-                let (left, right) = split.split_at_mut(at * depth);
-                gate(isa, &Gate { bev: &case.bev[..at], ..case.args() }, left);
-                gate(isa, &Gate { bev: &case.bev[at..], ..case.args() }, right);
-                assert_same_bits(&split, &want, "split");
-            }
-        }
-    }
-
     #[test]
     fn the_order_of_a_sum_shows() {
         let mut case = Case::new([3, 16, 64], 7, Rng::ordinary);
@@ -210,24 +190,6 @@ mod tests {
         (case.volume, case.bev) = (reverse_columns(&case.volume, 64), reverse_columns(&case.bev, 64));
         case.weights.reverse();
         assert_order_shows(&reverse_columns(&case.all(Isa::Scalar), 64), &want, "channels");
-    }
-
-    #[test]
-    fn the_scalar_code_agrees_with_f64() {
-        for shape in SHAPES {
-            let mut case = Case::new(shape, 12, Rng::ordinary);
-            let [_, depth, c] = shape;
-            case.weights = pad_rows(&Rng::new(13).ordinary(c), c, 0.0);
-            let want: Vec<f64> = (0..case.volume.len())
-                .map(|i| {
-                    let voxel = &case.volume[i / c * c..][..c];
-                    let products = voxel.iter().zip(&case.weights).map(|(x, w)| f64::from(*x) * f64::from(*w));
-                    let gate = 1.0 / (1.0 + (-(products.sum::<f64>() + f64::from(case.bias))).exp());
-                    f64::from(case.volume[i]) + gate * f64::from(case.bev[i / (c * depth) * c + i % c])
-                })
-                .collect();
-            assert_close(&case.all(Isa::Scalar), &want, 1e-6, &format!("{shape:?}"));
-        }
     }
 
     fn case() -> Case {

@@ -194,9 +194,9 @@ impl Kernel for Run<'_> {
             |first, count, Room { a, b, sums, product }| {
                 let source = Rows { data: &input[first * channels..], stride: channels };
                 layers[0].to::<Narrow>().compute(s, &source, &hidden, 0..count, a, product);
-                let source = Rows { data: &**a, stride: channels };
+                let source = Rows { data: a, stride: channels };
                 layers[1].to::<Narrow>().compute(s, &source, &hidden, 0..count, b, product);
-                let (source, target) = (Rows { data: &**b, stride: channels }, Linear { first: 0, stride: classes });
+                let (source, target) = (Rows { data: b, stride: channels }, Linear { first: 0, stride: classes });
                 layers[2].to::<Raw>().compute(s, &source, &target, 0..count, sums, product);
             },
             #[inline(always)]

@@ -125,7 +125,6 @@ pub(crate) mod cases;
 mod tests {
     use super::*;
     use crate::testing::{Fill, Rng, assert_lively, assert_same_bits};
-    use proptest::prelude::*;
 
     fn args(
         input: &[f32],
@@ -194,51 +193,6 @@ mod tests {
                     assert_same_bits(&all(isa, &args), &want, &format!("{isa:?} {shape:?} {window:?}"));
                 }
             }
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn any_shape_gives_the_scalar_bits(
-            h in 1usize..9, w in 1usize..9, c in 1usize..40, kernel in 1usize..5, stride in 1usize..4, seed: u64,
-        ) {
-            let padding = (seed % kernel as u64) as usize;
-            prop_assume!(h.min(w) + 2 * padding >= kernel);
-            let input = Rng::fill_of(seed)(&mut Rng::new(seed), h * w * c);
-            let args = args(&input, [h, w, c], [kernel, stride, padding]);
-            let want = all(Isa::Scalar, &args);
-            let height = args.output()[0];
-            for isa in Isa::available() {
-                assert_same_bits(&all(isa, &args), &want, "whole");
-                let split = [rows(isa, &args, 0..height / 2), rows(isa, &args, height / 2..height)].concat();
-                assert_same_bits(&split, &want, "split");
-            }
-        }
-    }
-
-    #[test]
-    fn the_scalar_code_agrees_with_a_padded_image() {
-        for (shape, [kernel, stride, padding]) in SHAPES {
-            let [h, w, c] = shape;
-            let input = Rng::new(6).ordinary(h * w * c);
-            let args = args(&input, shape, [kernel, stride, padding]);
-            let (ph, pw) = (h + 2 * padding, w + 2 * padding);
-            let mut padded = vec![f64::NEG_INFINITY; ph * pw * c];
-            for (i, &v) in input.iter().enumerate() {
-                let (y, x) = (i / (w * c) + padding, i / c % w + padding);
-                padded[(y * pw + x) * c + i % c] = f64::from(v);
-            }
-            let mut want = Vec::new();
-            for y in (0..=ph - kernel).step_by(stride) {
-                for x in (0..=pw - kernel).step_by(stride) {
-                    want.extend((0..c).map(|c_at| {
-                        let taps = (y..y + kernel).flat_map(|y| (x..x + kernel).map(move |x| (y * pw + x) * c + c_at));
-                        taps.map(|at| padded[at]).fold(f64::NEG_INFINITY, f64::max)
-                    }));
-                }
-            }
-            let got: Vec<f64> = all(Isa::Scalar, &args).into_iter().map(f64::from).collect();
-            assert_eq!(got, want, "{shape:?}");
         }
     }
 

@@ -117,8 +117,7 @@ pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{Fill, Rng, assert_close, assert_lively, assert_order_shows, assert_same_bits, pad_rows};
-    use proptest::prelude::*;
+    use crate::testing::{Fill, Rng, assert_lively, assert_order_shows, assert_same_bits, pad_rows};
 
     struct Case {
         channels: usize,
@@ -235,50 +234,11 @@ mod tests {
         }
     }
 
-    proptest! {
-        #[test]
-        fn any_shape_gives_the_scalar_bits(
-            rows in 0usize..12, channels in 1usize..70, before in 0usize..20, residual: bool, after: bool, relu: bool,
-            seed: u64,
-        ) {
-            let case = Case::new(rows, channels, residual, relu, seed, Rng::fill_of(seed));
-            let case = case.within(before, before / 2, after, seed, Rng::fill_of(seed));
-            let want = case.all(Isa::Scalar);
-            for isa in Isa::available() {
-                assert_same_bits(&case.all(isa), &want, "whole");
-                let mut split = case.x.clone();
-                let at = rows / 2 * case.stride;
-                let (top, bottom) = split.split_at_mut(at);
-                for (part, range) in [(top, 0..at), (bottom, at..rows * case.stride)] {
-                    let residual = case.residual.as_ref().map(|r| &r[range]);
-                    scale_shift(isa, &ScaleShift { residual, ..case.args() }, part);
-                }
-                assert_same_bits(&split, &want, "split");
-            }
-        }
-    }
-
     #[test]
     fn the_fused_rounding_shows() {
         let case = Case::new(9, 33, false, false, 7, Rng::ordinary);
         let twice = case.x.iter().enumerate().map(|(i, x)| x * case.scale[i % 33] + case.shift[i % 33]);
         assert_order_shows(&twice.collect::<Vec<_>>(), &case.all(Isa::Scalar), "rounded twice");
-    }
-
-    #[test]
-    fn the_scalar_code_agrees_with_f64() {
-        for [rows, channels] in SHAPES {
-            let case = Case::new(rows, channels, true, true, 5, Rng::ordinary);
-            let residual = case.residual.as_ref().unwrap();
-            let want: Vec<f64> = (0..rows * channels)
-                .map(|i| {
-                    let [x, scale, shift, residual] =
-                        [case.x[i], case.scale[i % channels], case.shift[i % channels], residual[i]].map(f64::from);
-                    (x * scale + shift + residual).max(0.0)
-                })
-                .collect();
-            assert_close(&case.all(Isa::Scalar), &want, 3e-7, &format!("{rows} x {channels}"));
-        }
     }
 
     fn case() -> Case {

@@ -93,8 +93,7 @@ pub(crate) mod cases;
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{Fill, Rng, assert_close, assert_lively, assert_same_bits};
-    use proptest::prelude::*;
+    use crate::testing::{Fill, Rng, assert_lively, assert_same_bits};
 
     fn args(
         low: &[f32],
@@ -147,49 +146,6 @@ mod tests {
                     assert_same_bits(&all(isa, &args, &large), &want, &format!("{isa:?} {low:?} {high:?}"));
                 }
             }
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn any_shape_gives_the_scalar_bits(
-            lh in 1usize..6, lw in 1usize..6, h in 1usize..8, w in 1usize..8, c in 1usize..40, seed: u64,
-        ) {
-            let mut rng = Rng::new(seed);
-            let fill = Rng::fill_of(seed);
-            let (small, large) = (fill(&mut rng, lh * lw * c), fill(&mut rng, h * w * c));
-            let args = args(&small, [lh, lw], [h, w, c]);
-            let want = all(Isa::Scalar, &args, &large);
-            for isa in Isa::available() {
-                assert_same_bits(&all(isa, &args, &large), &want, "whole");
-                let mut split = large.clone();
-                let (top, bottom) = split.split_at_mut(h / 2 * w * c);
-                upsample_add(isa, &args, 0..h / 2, top);
-                upsample_add(isa, &args, h / 2..h, bottom);
-                assert_same_bits(&split, &want, "split");
-            }
-        }
-    }
-
-    #[test]
-    fn the_scalar_code_agrees_with_f64() {
-        for (low, high) in SHAPES {
-            let mut rng = Rng::new(9);
-            let (small, large) = (rng.ordinary(low[0] * low[1] * high[2]), rng.ordinary(high.iter().product()));
-            let [h, w, c] = high;
-            let want: Vec<f64> = (0..large.len())
-                .map(|i| {
-                    let y = ((i / (w * c)) as f64 * low[0] as f64 / h as f64 + 1e-9).floor() as usize;
-                    let x = ((i / c % w) as f64 * low[1] as f64 / w as f64 + 1e-9).floor() as usize;
-                    f64::from(large[i]) + f64::from(small[(y * low[1] + x) * c + i % c])
-                })
-                .collect();
-            assert_close(
-                &all(Isa::Scalar, &args(&small, low, high), &large),
-                &want,
-                1e-7,
-                &format!("{low:?} {high:?}"),
-            );
         }
     }
 

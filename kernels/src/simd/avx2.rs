@@ -26,6 +26,27 @@ macro_rules! halves {
 // What takes more than an instruction or two is a function of its own: a closure has no instructions enabled, and what it
 // calls may stay a call.
 
+/// The nearest integers, ties to even.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn round(a: __m256) -> __m256 {
+    _mm256_round_ps::<{ _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC }>(a)
+}
+
+/// Where `a >= b`.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn at_least(a: __m256, b: __m256) -> __m256 {
+    _mm256_cmp_ps::<_CMP_GE_OQ>(a, b)
+}
+
+/// `a` where the mask holds, else 0.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn keep(mask: __m256, a: __m256i) -> __m256i {
+    _mm256_and_si256(_mm256_castps_si256(mask), a)
+}
+
 /// 2 to the power of each lane.
 #[inline]
 #[target_feature(enable = "avx2")]
@@ -154,8 +175,7 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn round(self, a: Self::V) -> Self::V {
-        // SAFETY: the token `self` proves that the CPU has AVX2.
-        a.map(|a| unsafe { _mm256_round_ps::<{ _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC }>(a) })
+        halves!(round(a))
     }
     #[inline(always)]
     fn exp2_int(self, n: Self::V) -> Self::V {
@@ -172,8 +192,9 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn shift_right(self, a: Self::I, bits: u32) -> Self::I {
-        // SAFETY: the token `self` proves that the CPU has AVX2.
-        a.map(|a| unsafe { _mm256_srl_epi32(a, _mm_cvtsi32_si128(bits.cast_signed())) })
+        // SAFETY: x86-64 always has SSE2.
+        let bits = unsafe { [_mm_cvtsi32_si128(bits.cast_signed()); 2] };
+        halves!(_mm256_srl_epi32(a, bits))
     }
     #[inline(always)]
     fn add_int(self, a: Self::I, b: Self::I) -> Self::I {
@@ -185,8 +206,7 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn keep(self, mask: Self::M, a: Self::I) -> Self::I {
-        // SAFETY: the token `self` proves that the CPU has AVX2.
-        unsafe { [0, 1].map(|i| _mm256_and_si256(_mm256_castps_si256(mask[i]), a[i])) }
+        halves!(keep(mask, a))
     }
     #[inline(always)]
     unsafe fn load_int_ptr(self, p: *const i32) -> Self::I {
@@ -283,8 +303,7 @@ impl Simd for Avx2 {
     }
     #[inline(always)]
     fn at_least(self, a: Self::V, b: Self::V) -> Self::M {
-        // SAFETY: the token `self` proves that the CPU has AVX2.
-        unsafe { [0, 1].map(|i| _mm256_cmp_ps::<_CMP_GE_OQ>(a[i], b[i])) }
+        halves!(at_least(a, b))
     }
     #[inline(always)]
     fn both(self, a: Self::M, b: Self::M) -> Self::M {

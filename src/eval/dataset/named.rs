@@ -2,8 +2,8 @@
 
 use super::nuscenes::{Labels, Scenes};
 use super::semantickitti::{Scans, Split};
-use super::{DataSet, NuScenes, Occ3dWaymo, SemanticKitti, SscBench, Synthetic, occ3d_waymo, sscbench};
-use crate::base::error::Result;
+use super::{DataSet, NuScenes, Occ3dWaymo, SemanticKitti, SscBench, Synthetic, UniOcc, occ3d_waymo, sscbench};
+use crate::base::error::{Error, Result};
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -19,16 +19,18 @@ Data sets:
   sscbench:ROOT[:SPLIT]               KITTI-360 of SSCBench, ROOT/{preprocess/labels,data_2d_raw,calibration}
   semantickitti:ROOT[:SPLIT[:stereo][:all]]
                                       scene completion of SemanticKITTI, ROOT/sequences/NN
+  uniocc:ROOT[:IMAGES]                UniOcc, ROOT/scene_infos.pkl and the frames that it lists, with its calibrations
 
 ROOT of nuScenes has samples/ and one v1.0-* of tables; of several, name the one, such as ROOT/v1.0-mini.
 SCENES: val (the official 150), train (all others), or a file with a name such as scene-0103 a line; all by default.
+IMAGES of UniOcc: the data set that the frames come from, such as nuScenes; ROOT by default.
 SPLIT of Waymo: training or validation; of KITTI-360: val (the default), train or test.
 SPLIT of SemanticKITTI: val (08, the default), train, test, or a sequence such as 05. stereo adds image_3 as a second camera.
 Scored is every fifth scan, as in the benchmark; all scores every scan that has labels.";
 
 const EXPECTED: &str = "expected synthetic:DIR, surroundocc:ROOT:LABELS[:SCENES], occ3d:ROOT:LABELS[:SCENES], \
-                        openocc:ROOT:LABELS[:SCENES], occ3d-waymo:ROOT:LABELS:SPLIT, sscbench:ROOT[:SPLIT] or \
-                        semantickitti:ROOT[:SPLIT[:stereo][:all]]";
+                        openocc:ROOT:LABELS[:SCENES], occ3d-waymo:ROOT:LABELS:SPLIT, sscbench:ROOT[:SPLIT], \
+                        semantickitti:ROOT[:SPLIT[:stereo][:all]] or uniocc:ROOT[:IMAGES]";
 
 /// A data set by its name, not yet opened. [`FORMS`] has the names.
 #[derive(Clone, Debug)]
@@ -45,6 +47,7 @@ enum Kind {
     Occ3dWaymo { root: PathBuf, labels: PathBuf, split: occ3d_waymo::Split },
     SscBench { root: PathBuf, split: sscbench::Split },
     SemanticKitti { root: PathBuf, split: Split, stereo: bool, scans: Scans },
+    UniOcc { root: PathBuf, images: PathBuf },
 }
 
 impl FromStr for Named {
@@ -74,6 +77,8 @@ impl FromStr for Named {
             ("semantickitti", [root, split, "stereo"]) => kitti(root, split.parse()?, true, Scans::Benchmark),
             ("semantickitti", [root, split, "all"]) => kitti(root, split.parse()?, false, Scans::Labelled),
             ("semantickitti", [root, split, "stereo", "all"]) => kitti(root, split.parse()?, true, Scans::Labelled),
+            ("uniocc", [root]) => Kind::UniOcc { root: root.into(), images: root.into() },
+            ("uniocc", [root, images]) => Kind::UniOcc { root: root.into(), images: images.into() },
             _ => return Err(EXPECTED.to_owned()),
         };
         Ok(Self { text: text.to_owned(), kind })
@@ -116,7 +121,23 @@ impl Named {
             Kind::SemanticKitti { root, split, stereo, scans } => {
                 Box::new(SemanticKitti::open(root, *split, *stereo, *scans)?)
             }
+            Kind::UniOcc { root, images } => Box::new(UniOcc::open(root, images)?),
         })
+    }
+}
+
+impl Named {
+    /// Opens a set of OpenOcc's, as [`write_submission`](crate::eval::write_submission) takes it.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Mismatch`](crate::ErrorKind::Mismatch) for another set; those of [`NuScenes::open`].
+    pub fn open_openocc(&self) -> Result<NuScenes> {
+        match &self.kind {
+            Kind::NuScenes { root, labels: Labels::OpenOcc, directory, scenes } => {
+                NuScenes::open(root, Labels::OpenOcc, directory, scenes)
+            }
+            _ => Err(Error::mismatch(format!("{self}, expected openocc:ROOT:LABELS[:SCENES]"))),
+        }
     }
 }
 
@@ -166,6 +187,14 @@ mod tests {
     }
 
     #[test]
+    fn uniocc_has_its_images_beside_it_or_elsewhere() {
+        for (text, expected) in [("uniocc:mini", ["mini", "mini"]), ("uniocc:mini:nuscenes", ["mini", "nuscenes"])] {
+            let Kind::UniOcc { root, images } = kind(text) else { panic!("UniOcc") };
+            assert_eq!([root, images], expected.map(PathBuf::from), "{text}");
+        }
+    }
+
+    #[test]
     fn what_names_no_set_is_refused() {
         for text in [
             "",
@@ -176,6 +205,7 @@ mod tests {
             "semantickitti:k:val:mono",
             "semantickitti:k:val:all:stereo",
             "occ3d-waymo:k:l",
+            "uniocc:mini:nuscenes:val",
         ] {
             assert_eq!(text.parse::<Named>().expect_err(text), EXPECTED);
         }

@@ -8,8 +8,9 @@ mod labels;
 mod splits;
 mod tables;
 
-use super::{DataSet, Frame, Grid, Pose, Published, Truth};
+use super::{DataSet, Grid, Pose, Published, Truth};
 use crate::base::error::{Error, Result};
+use crate::base::note::Note;
 use crate::image::file::read_image;
 use crate::scene::Scene;
 pub use crate::scene::camera::NUSCENES_RING as CAMERAS;
@@ -85,12 +86,13 @@ struct Entry {
     /// File of the lidar's sweep.
     lidar: String,
     /// In the order of [`CAMERAS`].
-    cameras: Vec<Camera>,
+    cameras: Vec<CameraImage>,
     lidar_to_ego: Pose,
+    lidar_to_global: Pose,
 }
 
 #[derive(Clone, Debug)]
-struct Camera {
+struct CameraImage {
     /// Its image, below the root.
     filename: String,
     /// Height and width.
@@ -112,6 +114,62 @@ impl NuScenes {
         let samples = directory.join("samples");
         let directory = if labels == Labels::SurroundOcc && samples.is_dir() { samples } else { directory.to_owned() };
         Ok(Self { root, labels, directory, entries })
+    }
+}
+
+/// What the challenge of OpenOcc needs to know.
+impl NuScenes {
+    /// Whose labels it has.
+    pub fn labels(&self) -> Labels {
+        self.labels
+    }
+
+    /// The token of the sample that frame `index` is.
+    ///
+    /// # Panics
+    /// If there is no such frame.
+    pub fn sample(&self, index: usize) -> &str {
+        self.entries[index].id.rsplit('/').next().unwrap_or_default()
+    }
+
+    /// The frame of Occ3D's and OpenOcc's voxels in that of the lidar, at frame `index`.
+    ///
+    /// # Panics
+    /// If there is no such frame.
+    pub fn grid_to_lidar(&self, index: usize) -> Pose {
+        self.entries[index].lidar_to_ego.inverse()
+    }
+
+    /// The places of the lidar in all frames of the scene of frame `index`, in metres of its vehicle, as the published program of
+    /// the challenge takes them: in the order of time, less than 39 m away along x and y, and of more than eight, eight that are spread evenly.
+    ///
+    /// # Panics
+    /// If there is no such frame.
+    pub fn ray_origins(&self, index: usize) -> Vec<[f64; 3]> {
+        let frame = &self.entries[index];
+        let scene = |entry: &Entry| entry.id.split('/').next().map(str::to_owned);
+        let from_global = frame.lidar_to_global.inverse();
+        let mut places = Vec::new();
+        for other in self.entries.iter().filter(|other| scene(other) == scene(frame)) {
+            // The program keeps them in f32, and the frame's own as exactly 0.
+            let place = if other.id == frame.id { [0.0; 3] } else { (from_global * other.lidar_to_global).origin() };
+            let place = frame.lidar_to_ego.apply(place.map(|v| f64::from(v as f32)));
+            if place[0].abs() < 39.0 && place[1].abs() < 39.0 {
+                places.push(place);
+            }
+        }
+        match places.len() {
+            0..=8 => places,
+            count => (0..8).map(|i| places[(i as f64 * (count - 1) as f64 / 7.0).round() as usize]).collect(),
+        }
+    }
+
+    /// The number that OpenOcc gives a class.
+    ///
+    /// # Panics
+    /// If `class` is none.
+    pub fn published_class(&self, class: u8) -> u8 {
+        labels::openocc_label(class)
     }
 }
 
@@ -178,14 +236,15 @@ impl DataSet for NuScenes {
         &self.entries[index].id
     }
 
-    fn frame(&self, index: usize) -> Result<Frame> {
+    fn scene(&self, index: usize) -> Result<(Scene, Vec<Note>)> {
+        let mut notes = Vec::new();
         let mut scene = Scene { names: Vec::new(), images: Vec::new(), lidar2img: Vec::new() };
         for (camera, name) in self.entries[index].cameras.iter().zip(CAMERAS) {
-            scene.images.push(read_image(&self.root.join(&camera.filename), name, Some(camera.size), &mut Vec::new())?);
+            scene.images.push(read_image(&self.root.join(&camera.filename), name, Some(camera.size), &mut notes)?);
             scene.names.push(name.to_owned());
             scene.lidar2img.push(camera.lidar2img);
         }
-        Ok(Frame { scene, truth: self.truth(index)? })
+        Ok((scene, notes))
     }
 
     fn truth(&self, index: usize) -> Result<Truth> {

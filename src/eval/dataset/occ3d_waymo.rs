@@ -4,11 +4,15 @@
 //! Below ROOT, `training/image_0` to `image_4` (`.jpg` or `.png`) and `training/calib/*.txt` are read. A file is called
 //! after its split, segment and frame: 0 for training or 1 for validation, three digits, three digits. Voxels lie in the frame
 //! of the vehicle, which is the one in which Waymo gives its points and in which networks of it see.
+//!
+//! Of the two programs that Occ3D has published for its scores, one counts the voxels of its mask *camera*, the other those
+//! that are in *camera* and in *fov*; the latter are a mask of their own here.
 
 use super::arrays::Arrays;
-use super::semantickitti::{product, rows};
-use super::{Axes, DataSet, Frame, Grid, Pose, Truth};
+use super::kitti::{product, rows};
+use super::{Axes, DataSet, Grid, Pose, Truth};
 use crate::base::error::{Error, Result};
+use crate::base::note::Note;
 use crate::image::file::read_image;
 use crate::scene::{Scene, check_finite};
 use std::path::{Path, PathBuf};
@@ -67,7 +71,7 @@ impl FromStr for Split {
     }
 }
 
-/// Occ3D-Waymo: the frames with labels in the order of segment and number, with the masks `lidar`, `camera` and `fov`.
+/// Occ3D-Waymo: the frames with labels in the order of segment and number, with the masks `lidar`, `camera`, `fov` and `camera+fov`.
 #[derive(Clone, Debug)]
 pub struct Occ3dWaymo {
     root: PathBuf,
@@ -129,7 +133,7 @@ impl DataSet for Occ3dWaymo {
     }
 
     fn masks(&self) -> &[&'static str] {
-        &["lidar", "camera", "fov"]
+        &["lidar", "camera", "fov", "camera+fov"]
     }
 
     fn len(&self) -> usize {
@@ -140,10 +144,11 @@ impl DataSet for Occ3dWaymo {
         &self.frames[index]
     }
 
-    fn frame(&self, index: usize) -> Result<Frame> {
+    fn scene(&self, index: usize) -> Result<(Scene, Vec<Note>)> {
         let file = self.file(index);
         let path = self.root.join("training/calib").join(format!("{file}.txt"));
         let text = std::fs::read_to_string(&path).map_err(|e| Error::io(&path, "read", &e))?;
+        let mut notes = Vec::new();
         let mut scene = Scene { names: Vec::new(), images: Vec::new(), lidar2img: Vec::new() };
         for (camera, name) in CAMERAS.into_iter().enumerate() {
             let matrix = rows(&text, &format!("P{camera}"))
@@ -157,11 +162,11 @@ impl DataSet for Occ3dWaymo {
             let images = self.root.join(format!("training/image_{camera}"));
             let jpeg = images.join(format!("{file}.jpg"));
             let image = if jpeg.exists() { jpeg } else { images.join(format!("{file}.png")) };
-            scene.images.push(read_image(&image, name, None, &mut Vec::new())?);
+            scene.images.push(read_image(&image, name, None, &mut notes)?);
             scene.names.push(name.to_owned());
             scene.lidar2img.push(matrix);
         }
-        Ok(Frame { scene, truth: self.truth(index)? })
+        Ok((scene, notes))
     }
 
     fn truth(&self, index: usize) -> Result<Truth> {
@@ -179,7 +184,8 @@ impl DataSet for Occ3dWaymo {
             let mask = arrays.take(name, GRID.size, u8::MAX)?;
             Ok(mask.into_iter().map(|state| u8::from(state != 0)).collect())
         });
-        let masks = masks.into_iter().collect::<Result<_>>()?;
+        let mut masks = masks.into_iter().collect::<Result<Vec<Vec<u8>>>>()?;
+        masks.push(masks[1].iter().zip(&masks[2]).map(|(camera, fov)| camera & fov).collect());
         Ok(Truth { labels, masks, origins: vec![LIDAR], grid_to_lidar: Pose::IDENTITY })
     }
 }

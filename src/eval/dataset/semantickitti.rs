@@ -4,10 +4,12 @@
 //! Below `ROOT/sequences/NN`, `calib.txt`, `image_2/*.png` (and `image_3`) and `voxels/*.{label,invalid}` are read. What one
 //! sweep alone occupies (`.bin`) and what is `.occluded` from every place are no part of the score, and not read.
 
-use super::{Axes, DataSet, Frame, Grid, IGNORED, Pose, Truth};
+use super::kitti::{GRID, check_pose, numbers, product, rows};
+use super::{DataSet, Grid, IGNORED, Truth};
 use crate::base::error::{Error, Result};
+use crate::base::note::Note;
 use crate::image::file::read_image;
-use crate::scene::matrix::{check_intrinsic, check_rigid};
+use crate::scene::matrix::check_intrinsic;
 use crate::scene::{Scene, check_finite};
 use std::fs::File;
 use std::io::Read;
@@ -37,9 +39,6 @@ pub const CLASSES: [&str; 20] = [
     "pole",
     "traffic sign",
 ];
-
-pub(super) const GRID: Grid =
-    Grid { size: [256, 256, 32], bounds: [[0.0, 51.2], [-25.6, 25.6], [-2.0, 4.4]], axes: Axes::Lidar };
 
 /// The class of a label as it is stored, of the official map; [`IGNORED`] for those that it counts nowhere, none for what is
 /// no label. Moving objects are of the class of those that stand.
@@ -142,11 +141,11 @@ pub struct SemanticKitti {
 #[derive(Clone, Debug)]
 struct Sequence {
     directory: PathBuf,
-    cameras: Vec<Camera>,
+    cameras: Vec<Projection>,
 }
 
 #[derive(Clone, Debug)]
-struct Camera {
+struct Projection {
     /// Its folder of images.
     name: &'static str,
     lidar2img: [f32; 16],
@@ -185,10 +184,12 @@ impl SemanticKitti {
             let text = std::fs::read_to_string(&path).map_err(|e| Error::io(&path, "read", &e))?;
             let cameras = names.iter().map(|&(name, key)| {
                 let (camera2img, lidar2camera) = (rows(&text, key)?, rows(&text, "Tr")?);
-                check_matrices(key, &camera2img, &lidar2camera)?;
+                check_pose("Tr", &lidar2camera)?;
+                check_intrinsic(&camera2img.map(|[x, y, z, _]| [x, y, z]))
+                    .map_err(|(found, expected)| Error::format(format!("{key}: {found}, expected {expected}")))?;
                 let lidar2img = product(&camera2img, &lidar2camera);
                 check_finite(name, &lidar2img)?;
-                Ok(Camera { name, lidar2img })
+                Ok(Projection { name, lidar2img })
             });
             let cameras = cameras.collect::<Result<_>>().map_err(|e| e.in_file(&path))?;
             let sequence = set.sequences.len();
@@ -211,63 +212,6 @@ impl SemanticKitti {
         }
         Ok(set)
     }
-}
-
-/// The numbers of the files in `directory` that end in `ending`, ascending.
-fn numbers(directory: &Path, ending: &str) -> Result<Vec<String>> {
-    let failed = |e: &std::io::Error| Error::io(directory, "read", e);
-    let mut stems = Vec::new();
-    for entry in std::fs::read_dir(directory).map_err(|e| failed(&e))? {
-        let name = entry.map_err(|e| failed(&e))?.file_name();
-        let stem = name.to_str().and_then(|n| n.strip_suffix(ending));
-        stems.extend(stem.filter(|s| !s.is_empty() && s.bytes().all(|b| b.is_ascii_digit())).map(str::to_owned));
-    }
-    stems.sort_unstable();
-    Ok(stems)
-}
-
-/// The 3x4 matrix of the line `key: ...` of a `calib.txt`.
-pub(super) fn rows(text: &str, key: &str) -> Result<[[f64; 4]; 3]> {
-    let mut lines = text.lines().filter_map(|line| line.strip_prefix(key)?.strip_prefix(':'));
-    let line = lines.next().ok_or_else(|| Error::format(format!("no line \"{key}:\", expected one of 12 numbers")))?;
-    if lines.next().is_some() {
-        return Err(Error::format(format!("two lines \"{key}:\", expected one")));
-    }
-    let mut numbers = [0.0; 12];
-    let mut found = 0;
-    for word in line.split_whitespace() {
-        let number = word.parse::<f64>().ok().filter(|n| n.is_finite());
-        let number = number.ok_or_else(|| Error::format(format!("{key}: {word:?}, expected a finite number")))?;
-        if let Some(place) = numbers.get_mut(found) {
-            *place = number;
-        }
-        found += 1;
-    }
-    if found != 12 {
-        return Err(Error::format(format!("{key}: {found} numbers, expected 12")));
-    }
-    Ok(std::array::from_fn(|row| std::array::from_fn(|column| numbers[4 * row + column])))
-}
-
-/// Refuses a `Tr` that is not rigid, and a projection whose camera is not upper triangular.
-fn check_matrices(key: &str, camera2img: &[[f64; 4]; 3], lidar2camera: &[[f64; 4]; 3]) -> Result<()> {
-    let [a, b, c] = *lidar2camera;
-    let wrong = |key: &str, (found, expected)| Error::format(format!("{key}: {found}, expected {expected}"));
-    check_rigid(&[a, b, c, [0.0, 0.0, 0.0, 1.0]]).map_err(|e| wrong("Tr", e))?;
-    check_intrinsic(&camera2img.map(|[x, y, z, _]| [x, y, z])).map_err(|e| wrong(key, e))
-}
-
-/// Row-major 4x4 of first the rigid `lidar2camera`, then `camera2img`: computed in f64, rounded once.
-pub(super) fn product(camera2img: &[[f64; 4]; 3], lidar2camera: &[[f64; 4]; 3]) -> [f32; 16] {
-    let mut matrix = [0.0; 16];
-    matrix[15] = 1.0;
-    for (row, factors) in camera2img.iter().enumerate() {
-        for column in 0..4 {
-            let sum: f64 = (0..3).map(|i| factors[i] * lidar2camera[i][column]).sum();
-            matrix[4 * row + column] = (sum + if column == 3 { factors[3] } else { 0.0 }) as f32;
-        }
-    }
-    matrix
 }
 
 /// The bytes of a file that has `expected` of them.
@@ -294,10 +238,6 @@ impl DataSet for SemanticKitti {
         GRID
     }
 
-    fn masks(&self) -> &[&'static str] {
-        &[]
-    }
-
     fn len(&self) -> usize {
         self.frames.len()
     }
@@ -306,17 +246,18 @@ impl DataSet for SemanticKitti {
         &self.frames[index].id
     }
 
-    fn frame(&self, index: usize) -> Result<Frame> {
+    fn scene(&self, index: usize) -> Result<(Scene, Vec<Note>)> {
         let frame = &self.frames[index];
         let sequence = &self.sequences[frame.sequence];
+        let mut notes = Vec::new();
         let mut scene = Scene { names: Vec::new(), images: Vec::new(), lidar2img: Vec::new() };
         for camera in &sequence.cameras {
             let path = sequence.directory.join(camera.name).join(format!("{}.png", frame.stem()));
-            scene.images.push(read_image(&path, camera.name, None, &mut Vec::new())?);
+            scene.images.push(read_image(&path, camera.name, None, &mut notes)?);
             scene.names.push(camera.name.to_owned());
             scene.lidar2img.push(camera.lidar2img);
         }
-        Ok(Frame { scene, truth: self.truth(index)? })
+        Ok((scene, notes))
     }
 
     fn truth(&self, index: usize) -> Result<Truth> {
@@ -335,8 +276,7 @@ impl DataSet for SemanticKitti {
             let known = invalid[at / 8] >> (7 - at % 8) & 1 == 0;
             labels.push(if known { class } else { IGNORED });
         }
-        // The lidar is where the frame's metres begin.
-        Ok(Truth { labels, masks: vec![], origins: vec![[0.0; 3]], grid_to_lidar: Pose::IDENTITY })
+        Ok(Truth::of_lidar(labels))
     }
 }
 

@@ -5,9 +5,10 @@
 //! `calibration/calib_cam_to_velo.txt` are read. The labels at full resolution already have the unified classes, and what is
 //! invalid in them; `voxels/*.{bin,label,invalid}`, from which they were made, are not read.
 
-use super::semantickitti::GRID;
-use super::{DataSet, Frame, Grid, Pose, Truth, check_labels};
+use super::kitti::{GRID, check_pose, matrix, numbers, parse, product, rows, values};
+use super::{DataSet, Grid, Truth, check_labels};
 use crate::base::error::{Error, Result};
+use crate::base::note::Note;
 use crate::file::npz::read_npy_integers;
 use crate::image::file::read_image;
 use crate::scene::{Scene, check_finite};
@@ -95,26 +96,14 @@ impl SscBench {
         for drive in split.drives() {
             let name = format!("2013_05_28_drive_{drive:04}_sync");
             let directory = root.join("preprocess/labels").join(&name);
-            frames.extend(labelled(&directory)?.into_iter().map(|number| format!("{name}/{number}")));
+            let labelled = numbers(&directory, "_1_1.npy")?;
+            if labelled.is_empty() {
+                return Err(Error::format("no labels, expected files such as 000005_1_1.npy").in_file(&directory));
+            }
+            frames.extend(labelled.into_iter().map(|number| format!("{name}/{number}")));
         }
         Ok(Self { root: root.to_owned(), lidar2img, frames })
     }
-}
-
-/// Numbers of the frames with labels at full resolution in `directory`, ascending.
-fn labelled(directory: &Path) -> Result<Vec<String>> {
-    let failed = |e: &std::io::Error| Error::io(directory, "read", e);
-    let mut numbers = Vec::new();
-    for entry in std::fs::read_dir(directory).map_err(|e| failed(&e))? {
-        let name = entry.map_err(|e| failed(&e))?.file_name();
-        let number = name.to_str().and_then(|name| name.strip_suffix("_1_1.npy"));
-        numbers.extend(number.filter(|n| !n.is_empty() && n.bytes().all(|b| b.is_ascii_digit())).map(str::to_owned));
-    }
-    if numbers.is_empty() {
-        return Err(Error::format("no labels, expected files such as 000005_1_1.npy").in_file(directory));
-    }
-    numbers.sort_unstable();
-    Ok(numbers)
 }
 
 /// P_rect_00 * R_rect_00 * inverse(camera to lidar), in f64 and rounded once.
@@ -122,61 +111,34 @@ fn calibration(directory: &Path) -> Result<[f32; 16]> {
     let read = |path: &Path| std::fs::read_to_string(path).map_err(|e| Error::io(path, "read", &e));
     let path = directory.join("perspective.txt");
     let text = read(&path)?;
-    let projection: [f64; 12] = numbers(&text, Some("P_rect_00:")).map_err(|e| e.in_file(&path))?;
-    let turn: [f64; 9] = numbers(&text, Some("R_rect_00:")).map_err(|e| e.in_file(&path))?;
+    let camera2img = rows(&text, "P_rect_00").map_err(|e| e.in_file(&path))?;
+    let turn: [f64; 9] = values(&text, "R_rect_00").map_err(|e| e.in_file(&path))?;
     let path = directory.join("calib_cam_to_velo.txt");
-    let camera: [f64; 12] = numbers(&read(&path)?, None).map_err(|e| e.in_file(&path))?;
-    let lidar_to_camera = inverse(&camera).map_err(|e| e.in_file(&path))?;
-    let mut matrix = [0.0; 16];
-    matrix[15] = 1.0;
-    for column in 0..4 {
-        let point = [0, 1, 2].map(|row| lidar_to_camera[4 * row + column]);
-        let turned = [0, 1, 2].map(|row| (0..3).map(|i| turn[3 * row + i] * point[i]).sum::<f64>());
-        for row in 0..3 {
-            let sum: f64 = (0..3).map(|i| projection[4 * row + i] * turned[i]).sum();
-            matrix[4 * row + column] = (sum + if column == 3 { projection[4 * row + 3] } else { 0.0 }) as f32;
-        }
-    }
+    let camera_to_lidar = pose(&read(&path)?).map_err(|e| e.in_file(&path))?;
+    let lidar2camera = inverse(&camera_to_lidar);
+    let turned = [0, 1, 2]
+        .map(|row| [0, 1, 2, 3].map(|column| (0..3).map(|i| turn[3 * row + i] * lidar2camera[i][column]).sum::<f64>()));
+    let matrix = product(&camera2img, &turned);
     check_finite(CAMERA, &matrix).map_err(|e| e.in_file(&path))?;
     Ok(matrix)
 }
 
-/// The numbers behind `key`, or of the first line.
-fn numbers<const N: usize>(text: &str, key: Option<&str>) -> Result<[f64; N]> {
-    let name = key.unwrap_or("first line");
-    let line = match key {
-        Some(key) => text.lines().find_map(|line| line.strip_prefix(key)),
-        None => text.lines().next(),
-    };
-    let line = line.ok_or_else(|| Error::format(format!("no line \"{name}\", expected one of {N} numbers")))?;
-    let parsed = line.split_whitespace().map(|word| {
-        let number = word.parse::<f64>().ok().filter(|n| n.is_finite());
-        number.ok_or_else(|| Error::format(format!("{name} {word:?}, expected a finite number")))
-    });
-    let numbers: Vec<f64> = parsed.collect::<Result<_>>()?;
-    let found = numbers.len();
-    numbers.try_into().map_err(|_| Error::format(format!("{name} {found} numbers, expected {N}")))
+/// The pose that stands alone in a file.
+fn pose(text: &str) -> Result<[[f64; 4]; 3]> {
+    const NAME: &str = "camera to lidar";
+    let line = text.lines().next().unwrap_or_default();
+    let pose = matrix(&parse(line, NAME)?);
+    check_pose(NAME, &pose)?;
+    Ok(pose)
 }
 
 /// The inverse of a rigid 3x4.
-fn inverse(matrix: &[f64; 12]) -> Result<[f64; 12]> {
-    let row = |r: usize| [matrix[4 * r], matrix[4 * r + 1], matrix[4 * r + 2]];
-    let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-    let rigid = (0..3).all(|i| (0..3).all(|j| (dot(row(i), row(j)) - f64::from(u8::from(i == j))).abs() < 1e-3));
-    let [[a, b, c], [d, e, f], third] = [row(0), row(1), row(2)];
-    let cross = [b * f - c * e, c * d - a * f, a * e - b * d];
-    // Right angles alone would let a mirror pass.
-    if !rigid || dot(cross, third) < 0.0 {
-        return Err(Error::format("camera to lidar is no rotation, expected rows of length 1 at right angles"));
-    }
-    let shift = [3, 7, 11].map(|i| matrix[i]);
-    let column = |c: usize| [matrix[c], matrix[4 + c], matrix[8 + c]];
-    let mut inverse = [0.0; 12];
-    for r in 0..3 {
-        inverse[4 * r..4 * r + 3].copy_from_slice(&column(r));
-        inverse[4 * r + 3] = -dot(column(r), shift);
-    }
-    Ok(inverse)
+fn inverse(pose: &[[f64; 4]; 3]) -> [[f64; 4]; 3] {
+    [0, 1, 2].map(|r| {
+        let column = pose.map(|row| row[r]);
+        let shift: f64 = (0..3).map(|i| column[i] * pose[i][3]).sum();
+        [column[0], column[1], column[2], -shift]
+    })
 }
 
 impl DataSet for SscBench {
@@ -188,10 +150,6 @@ impl DataSet for SscBench {
         GRID
     }
 
-    fn masks(&self) -> &[&'static str] {
-        &[]
-    }
-
     fn len(&self) -> usize {
         self.frames.len()
     }
@@ -200,18 +158,19 @@ impl DataSet for SscBench {
         &self.frames[index]
     }
 
-    fn frame(&self, index: usize) -> Result<Frame> {
+    fn scene(&self, index: usize) -> Result<(Scene, Vec<Note>)> {
         let (drive, number) = self.frames[index].split_once('/').unwrap_or_default();
         let directory = self.root.join("data_2d_raw").join(drive).join(CAMERA).join("data_rect");
         // Images of KITTI-360 itself have ten digits.
         let short = directory.join(format!("{number}.png"));
         let path = if short.exists() { short } else { directory.join(format!("{number:0>10}.png")) };
+        let mut notes = Vec::new();
         let scene = Scene {
             names: vec![CAMERA.to_owned()],
-            images: vec![read_image(&path, CAMERA, None, &mut Vec::new())?],
+            images: vec![read_image(&path, CAMERA, None, &mut notes)?],
             lidar2img: vec![self.lidar2img],
         };
-        Ok(Frame { scene, truth: self.truth(index)? })
+        Ok((scene, notes))
     }
 
     fn truth(&self, index: usize) -> Result<Truth> {
@@ -223,7 +182,7 @@ impl DataSet for SscBench {
         let labels: Option<Vec<u8>> = values.iter().map(|&value| u8::try_from(value).ok()).collect();
         let labels = labels.ok_or_else(|| Error::format("a label beyond 255, expected a class").in_file(&path))?;
         check_labels(&labels, CLASSES.len()).map_err(|e| e.in_file(&path))?;
-        Ok(Truth { labels, masks: vec![], origins: vec![[0.0; 3]], grid_to_lidar: Pose::IDENTITY })
+        Ok(Truth::of_lidar(labels))
     }
 }
 

@@ -1,7 +1,8 @@
 //! Sets that `voxcast synth --set` wrote: `set.json`, and a `.safetensors` per seed.
 
-use super::{DataSet, Frame, Grid, Pose, Truth, check_labels};
+use super::{DataSet, Grid, Pose, Truth, check_labels};
 use crate::base::error::{Error, Result};
+use crate::base::note::Note;
 use crate::file::container::Container;
 use crate::network::Network;
 use crate::scene::Scene;
@@ -103,11 +104,9 @@ impl DataSet for Synthetic {
         &self.seeds[index]
     }
 
-    fn frame(&self, index: usize) -> Result<Frame> {
-        self.with_file(index, |file| {
-            let scene = Scene::from_safetensors(file.bytes())?;
-            Ok(Frame { scene, truth: self.read_truth(file)? })
-        })
+    fn scene(&self, index: usize) -> Result<(Scene, Vec<Note>)> {
+        // Of its own files there is nothing to be said.
+        Ok((self.with_file(index, |file| Scene::from_safetensors(file.bytes()))?, Vec::new()))
     }
 
     fn truth(&self, index: usize) -> Result<Truth> {

@@ -18,6 +18,7 @@ mod normalise;
 mod product;
 mod upsample_add;
 mod window_attention;
+mod winograd;
 
 pub use description::{Description, Machine, Shader};
 
@@ -54,6 +55,7 @@ macro_rules! operations {
 operations! {
     normalise::Normalise,
     conv::Conv,
+    winograd::Winograd,
     deform_conv::DeformConv,
     depthwise::Depthwise,
     batch_norm::BatchNorm,

@@ -34,9 +34,21 @@ pub(super) fn multiply_adds(geometry: &Geometry, site: &Site<'_>) -> u128 {
     wide(site.rows()) * wide(geometry.depth()) * wide(site.channels)
 }
 
-/// The right matrix, with the residual as the kernel takes it.
+/// The right matrix, and what is added.
 pub(super) fn product<'a>(call: &Call<'a>, depth: usize) -> Product<'a> {
-    let residual = match call.added {
+    Product {
+        weights: call.parts[0].panels(),
+        bias: call.part(1),
+        depth,
+        columns: call.site.channels,
+        relu: call.site.relu,
+        residual: residual(call),
+    }
+}
+
+/// What is added, as the kernels take it.
+pub(super) fn residual<'a>(call: &Call<'a>) -> Residual<'a> {
+    match call.added {
         Added::Nothing => Residual::None,
         Added::InPlace => Residual::InPlace,
         Added::Apart { elements, after } => {
@@ -44,14 +56,6 @@ pub(super) fn product<'a>(call: &Call<'a>, depth: usize) -> Product<'a> {
             let (rows, stride) = (elements.of(), call.site.output().channels);
             if after { Residual::After { rows, stride } } else { Residual::Before { rows, stride } }
         }
-    };
-    Product {
-        weights: call.parts[0].panels(),
-        bias: call.part(1),
-        depth,
-        columns: call.site.channels,
-        relu: call.site.relu,
-        residual,
     }
 }
 

@@ -12,9 +12,10 @@
 //! There are no checksums. The file must end where its last storage does.
 
 use super::Contents;
-use super::pickle::{Pickle, Value};
+use super::calls::{Object, Torch};
 use super::pth::{self, Records, Source};
 use crate::base::error::{Error, ErrorKind, Result};
+use crate::file::pickle::{Pickle, Value};
 use std::collections::HashMap;
 
 /// The number that the first pickle is of, as the pickle writes it.
@@ -55,12 +56,11 @@ fn unsupported<T>(what: String) -> Result<T> {
 }
 
 /// Refuses elements of the other byte order.
-fn check_machine(pickle: &Pickle<'_>) -> Result<()> {
+fn check_machine(pickle: &Pickle<'_, Torch>) -> Result<()> {
     let Value::Dict(facts) = pickle.root() else {
         return Err(Error::format(format!("the machine is {}, expected a dict", pickle.root().kind())));
     };
-    let is_order = |id| matches!(pickle.get(id), Value::Str(t) if pickle.text(*t) == b"little_endian");
-    match facts.iter().rev().find(|(key, _)| is_order(*key)).map(|&(_, value)| pickle.get(value)) {
+    match pickle.under(facts, "little_endian").map(|value| pickle.get(value)) {
         Some(Value::Bool(true)) => Ok(()),
         Some(Value::Bool(false)) => {
             unsupported("little_endian is False, expected True; re-save on a little-endian machine".into())
@@ -70,9 +70,13 @@ fn check_machine(pickle: &Pickle<'_>) -> Result<()> {
 }
 
 /// Where the storages lie that `keys` lists, from byte `at` on.
-fn records(bytes: &[u8], mut at: usize, pickle: &Pickle<'_>, keys: &Pickle<'_>) -> Result<Records> {
+fn records(bytes: &[u8], mut at: usize, pickle: &Pickle<'_, Torch>, keys: &Pickle<'_, Torch>) -> Result<Records> {
     let mut sizes = HashMap::new();
-    for storage in pickle.storages() {
+    let storages = pickle.objects().filter_map(|object| match object {
+        Object::Storage(storage) => Some(storage),
+        Object::Tensor(_) => None,
+    });
+    for storage in storages {
         let (key, size) = (pickle.text(storage.key), storage.element.size);
         if *sizes.entry(key).or_insert(size) != size {
             return Err(Error::format(format!("storage {} has elements of two sizes", shown(key))));

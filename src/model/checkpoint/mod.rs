@@ -18,10 +18,10 @@
 //! called. See [`Checkpoint::from_bytes`] for everything that is checked.
 
 mod archive;
+mod calls;
 mod globals;
 mod legacy;
 mod names;
-mod pickle;
 mod plain;
 mod pth;
 mod tensor;
@@ -143,20 +143,34 @@ impl Checkpoint {
     /// What is to be said of the file: under which key its tensors are, if under another than `state_dict`, which other
     /// states it has, and how many names had something in front.
     pub fn notes(&self) -> Vec<Note> {
-        let note = |message: &String| {
-            let note = Note::new(message);
-            match &self.path {
-                Some(path) => note.in_file(path),
-                None => note,
-            }
-        };
-        self.contents.notes.iter().map(note).collect()
+        self.contents.notes.iter().map(|message| self.note(message)).collect()
     }
 
     /// Names that [`Checkpoint::get`] was never asked for, in ascending order: after an import, what the model does not have.
     pub fn unused(&self) -> impl Iterator<Item = &str> {
         let names = self.contents.names.iter();
         names.filter(|&(_, &index)| !self.asked[index].load(Ordering::Relaxed)).map(|(name, _)| name.as_str())
+    }
+
+    /// What is to be said of [`Checkpoint::unused`] after an import: tensors that would change the result if the network had
+    /// them. Counters of batch norms and of moving averages are none.
+    pub fn unused_note(&self) -> Option<Note> {
+        const COUNTERS: [&str; 3] = ["num_batches_tracked", "steps", "n_averaged"];
+        let is_counter = |name: &str| COUNTERS.contains(&name.rsplit('.').next().unwrap_or(name));
+        let unused: Vec<&str> = self.unused().filter(|name| !is_counter(name)).collect();
+        let shown: Vec<String> = unused.iter().take(3).map(|name| format!("{name:?}")).collect();
+        let more = if unused.len() > 3 { ", ..." } else { "" };
+        let message = format!("{} tensors that the network does not have: {}{more}", unused.len(), shown.join(", "));
+        (!unused.is_empty()).then(|| self.note(&message))
+    }
+
+    /// A note on the file.
+    fn note(&self, message: &str) -> Note {
+        let note = Note::new(message);
+        match &self.path {
+            Some(path) => note.in_file(path),
+            None => note,
+        }
     }
 
     /// Up to three names that are most like `name`, for a message that it is missing.

@@ -2,9 +2,10 @@
 
 use super::Contents;
 use super::archive::{Archive, Storage};
-use super::pickle::{Id, Pickle, TensorRef, Value};
+use super::calls::{Object, TensorRef, Torch};
 use super::tensor::{MAX_DIMS, Tensor};
 use crate::base::error::{Error, ErrorKind, Result};
+use crate::file::pickle::{Id, Pickle, Value};
 use std::collections::HashMap;
 use std::ops::Range;
 
@@ -23,7 +24,7 @@ pub(super) fn read(file: &[u8]) -> Result<Contents> {
 }
 
 /// Lists the tensors of a pickle's state dict, whose storages `source` has.
-pub(super) fn list(pickle: &Pickle<'_>, source: Source<'_>) -> Result<Contents> {
+pub(super) fn list(pickle: &Pickle<'_, Torch>, source: Source<'_>) -> Result<Contents> {
     let (dict, notes) = state_dict(pickle)?;
     let mut reader = Reader {
         pickle,
@@ -33,7 +34,7 @@ pub(super) fn list(pickle: &Pickle<'_>, source: Source<'_>) -> Result<Contents> 
         ids: HashMap::new(),
     };
     for &(key, value) in dict {
-        if let (&Value::Str(name), Value::Tensor(tensor)) = (pickle.get(key), pickle.get(value)) {
+        if let (&Value::Str(name), Value::Object(Object::Tensor(tensor))) = (pickle.get(key), pickle.get(value)) {
             let name = std::str::from_utf8(pickle.text(name))
                 .map_err(|_| Error::format("the state dict has a name that is not UTF-8"))?;
             reader.add(name, value, tensor)?;
@@ -117,20 +118,16 @@ const STATE_DICTS: [&str; 8] =
 type Chosen<'p> = (&'p [(Id, Id)], Vec<String>);
 
 /// The dict of tensors: under a key of [`STATE_DICTS`] at the top, or the top itself.
-fn state_dict<'p>(pickle: &'p Pickle<'_>) -> Result<Chosen<'p>> {
+fn state_dict<'p>(pickle: &'p Pickle<'_, Torch>) -> Result<Chosen<'p>> {
     let Value::Dict(top) = pickle.root() else {
         return Err(Error::format(format!("the checkpoint is {}, expected a dict", pickle.root().kind())));
     };
-    // As in Python, the last of equal keys counts.
-    let under = |name: &str| {
-        let is_it = |id| matches!(pickle.get(id), Value::Str(t) if pickle.text(*t) == name.as_bytes());
-        top.iter().rev().find(|(key, _)| is_it(*key)).map(|&(_, value)| pickle.get(value))
-    };
+    let under = |name: &str| pickle.under(top, name).map(|value| pickle.get(value));
     match under("state_dict") {
         None | Some(Value::Dict(_)) => {}
         Some(other) => return Err(Error::format(format!("state_dict is {}, expected a dict", other.kind()))),
     }
-    let is_tensor = |&(_, value): &(Id, Id)| matches!(pickle.get(value), Value::Tensor(_));
+    let is_tensor = |&(_, value): &(Id, Id)| matches!(pickle.get(value), Value::Object(Object::Tensor(_)));
     if under("state_dict").is_none() && top.iter().any(is_tensor) {
         return Ok((top, Vec::new()));
     }
@@ -155,7 +152,7 @@ fn state_dict<'p>(pickle: &'p Pickle<'_>) -> Result<Chosen<'p>> {
 }
 
 /// The first few keys of a dict, for a message.
-fn keys(pickle: &Pickle<'_>, dict: &[(Id, Id)]) -> String {
+fn keys(pickle: &Pickle<'_, Torch>, dict: &[(Id, Id)]) -> String {
     let names = dict.iter().filter_map(|&(key, _)| match pickle.get(key) {
         Value::Str(text) => {
             let bytes = pickle.text(*text);
@@ -168,7 +165,7 @@ fn keys(pickle: &Pickle<'_>, dict: &[(Id, Id)]) -> String {
 }
 
 struct Reader<'p, 'a> {
-    pickle: &'p Pickle<'p>,
+    pickle: &'p Pickle<'p, Torch>,
     source: Source<'a>,
     contents: Contents,
     /// Storages by their key.
@@ -225,7 +222,7 @@ impl<'p> Reader<'p, '_> {
 
     /// Index of the storage, which has exactly the declared length.
     fn storage(&mut self, id: Id) -> Result<usize> {
-        let Value::Storage(storage) = self.pickle.get(id) else {
+        let Value::Object(Object::Storage(storage)) = self.pickle.get(id) else {
             return Err(Error::format(format!("its storage is {}", self.pickle.get(id).kind())));
         };
         let key = self.pickle.text(storage.key);

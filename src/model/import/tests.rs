@@ -3,9 +3,9 @@
 use super::*;
 use crate::base::random::Random;
 use crate::graph::parts::Storage;
-use crate::graph::{Results, Rewrites};
+use crate::graph::{Op, Results, Rewrites};
 use crate::small;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use voxcast_kernels::deconv3d::kernel_tap;
 use voxcast_kernels::panels::{packed_index, packed_len};
 
@@ -152,6 +152,39 @@ fn transposed_weights_reach_the_voxels_that_they_should() {
     assert_eq!(seen.len(), 64, "each of the kernel's taps is used once");
 }
 
+/// Of every operation of a network that has both tiles, in planes and in volumes.
+#[test]
+fn transformed_weights_are_those_of_the_direct_convolution() {
+    let network = Network {
+        image: [96, 160],
+        block: crate::network::Block::Basic,
+        dcn: [false; 4],
+        width: 32,
+        channels: [16, 32, 16, 8],
+        key_dims: [4, 2, 1],
+        grids: [[24, 24, 4], [12, 12, 2], [6, 6, 1]],
+        ..small::tiny()
+    };
+    let graph = |winograd| Graph::build(&network, Results::ALL).rewritten(Rewrites { winograd, ..Rewrites::ALL });
+    let (source, direct, filtered) = (Drawn::default(), graph(false), graph(true));
+    let mut kinds = BTreeSet::new();
+    for operation in &filtered.operations {
+        let Op::Winograd(winograd) = &operation.op else { continue };
+        kinds.insert(operation.op.description().kind());
+        let [old, new] = [&direct, &filtered].map(|graph| evaluate(&source, graph, &operation.name));
+        let depth = winograd.geometry.depth();
+        let expected = winograd.transformed(|k, n| f64::from(old[0][packed_index(depth, k, n)]));
+        assert_eq!(new[1], old[1], "{}: the bias", operation.name);
+        for (found, expected) in new[0].iter().zip(expected) {
+            assert_near(*found, expected, &operation.name);
+        }
+    }
+    assert_eq!(
+        kinds.into_iter().collect::<Vec<_>>(),
+        ["conv2d F(2,3)", "conv2d F(4,3)", "conv3d F(2,3)", "conv3d F(4,3)"]
+    );
+}
+
 #[test]
 fn a_norm_of_its_own_is_scale_and_shift() {
     let (source, graph) = (Drawn::default(), graph(Rewrites::NONE));
@@ -212,7 +245,7 @@ fn numbers_that_cannot_be_stored_are_named() {
 fn contradictory_options_are_refused_and_progress_is_told() {
     let directory = tempfile::tempdir().expect("a place");
     let path = directory.path().join("model");
-    let rewrites = Rewrites { batch_norm: false, projection: true };
+    let rewrites = Rewrites { batch_norm: false, ..Rewrites::ALL };
     let options = Options { rewrites, ..Options::default() };
     let error = import(&Drawn::default(), &small::tiny(), options, &path, &mut |_, _| ()).expect_err("a contradiction");
     assert_eq!(error.kind(), ErrorKind::Unsupported);

@@ -3,6 +3,7 @@
 use super::CameraStatus;
 use crate::base::digest;
 use crate::graph::{Csr, Element, Graph, Scope};
+use crate::network::Grid;
 use crate::runtime::arena::Arena;
 use crate::runtime::plan::{Plan, Region};
 use std::ops::Range;
@@ -11,8 +12,8 @@ use voxcast_kernels::gather::Mask;
 /// The result of a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Occupancy<'a> {
-    /// Voxels along x, y, z.
-    pub grid: [usize; 3],
+    /// Where the voxels are: the network's output grid, in the lidar's frame.
+    pub grid: Grid,
     /// Class of each voxel, `[x, y, z]`, z fastest; 0 is empty.
     pub classes: &'a [u8],
     /// `[x, y, z, classes]`, if the session keeps them.
@@ -60,18 +61,18 @@ impl Occupancy<'_> {
 
 /// A result that has left its session ([`Session::take`](super::Session::take)).
 pub struct OwnedOccupancy {
-    grid: [usize; 3],
+    grid: Grid,
     output: Output,
 }
 
 impl std::fmt::Debug for OwnedOccupancy {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("OwnedOccupancy").field("grid", &self.grid).finish_non_exhaustive()
+        f.debug_struct("OwnedOccupancy").field("grid", &self.grid.size).finish_non_exhaustive()
     }
 }
 
 impl OwnedOccupancy {
-    pub(super) fn new(grid: [usize; 3], output: Output) -> Self {
+    pub(super) fn new(grid: Grid, output: Output) -> Self {
         Self { grid, output }
     }
 
@@ -163,8 +164,8 @@ impl Output {
         self.logits.is_some()
     }
 
-    /// The result of a grid of `grid`.
-    pub(super) fn occupancy(&self, grid: [usize; 3]) -> Occupancy<'_> {
+    /// The result, whose voxels are those of `grid`.
+    pub(super) fn occupancy(&self, grid: Grid) -> Occupancy<'_> {
         let bytes = self.memory.bytes();
         Occupancy {
             grid,
@@ -209,7 +210,7 @@ fn count_support(support: &mut [u16], volume: Csr<'_>, mask: Option<Mask<'_>>, c
 
 /// Voxels of a result.
 fn voxels(graph: &Graph) -> usize {
-    graph.network.output_grid().iter().product()
+    Grid::of(&graph.network).voxels()
 }
 
 /// `len` zeros, unless the system has no memory for them.
@@ -229,8 +230,8 @@ mod tests {
     #[test]
     fn bits_by_hand() {
         let classes = [0, 1, 0, 0, 18, 0, 0, 7, 0, 255, 0];
-        let occupancy =
-            Occupancy { grid: [11, 1, 1], classes: &classes, logits: None, support: &[0; 11], cameras: &[] };
+        let grid = Grid::new([11, 1, 1], [[0.0, 1.0]; 3]);
+        let occupancy = Occupancy { grid, classes: &classes, logits: None, support: &[0; 11], cameras: &[] };
         let mut bits = [0xff; 2];
         occupancy.write_bits(&mut bits);
         assert_eq!((occupancy.bits_len(), bits), (2, [0b1001_0010, 0b10]));
@@ -263,7 +264,7 @@ mod tests {
         let plan = Plan::new(&graph, 2, 1).expect("small");
         let mut output = Output::new(&graph, &plan, 2).expect("small");
         assert_eq!(Some(output.bytes()), Output::bytes_for(&graph, &plan, 2));
-        let result = output.occupancy([8; 3]);
+        let result = output.occupancy(Grid::of(&network));
         assert_eq!((result.classes.len(), result.logits.map(<[f32]>::len)), (512, Some(512 * 17)));
         let ptr: Vec<u32> = (0..=64).collect();
         let one = Csr { ptr: &ptr, col: &[0; 64] };

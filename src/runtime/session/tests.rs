@@ -53,7 +53,7 @@ fn images_that_do_not_fit_are_refused() {
 fn scenes_that_do_not_fit_are_refused() {
     let mut session = session();
     let scene = small::scene(&tiny(), 1);
-    assert_eq!(session.run_scene(&scene).expect("a scene of this network").grid, [16, 8, 8]);
+    assert_eq!(session.run_scene(&scene).expect("a scene of this network").grid.size, [16, 8, 8]);
     let other = small::scene(&Network { image: [32, 32], ..tiny() }, 1);
     assert!(session.run_scene(&other).expect_err("another size").message().contains("32x32"));
     let fewer = small::scene(&Network { cameras: 1, ..tiny() }, 1);
@@ -130,7 +130,7 @@ fn results_that_are_taken_out_stay_and_lend_their_memory() {
     session.set_cameras(&frame(1)).expect("sound images");
     assert_eq!(session.step(Budget::Unlimited), Step::Complete);
     assert_eq!([digest(&first.view()), digest(&session.occupancy().expect("a result"))], expected);
-    assert_eq!(first.view().grid, [16, 8, 8]);
+    assert_eq!(first.view().grid.size, [16, 8, 8]);
 
     let second = session.take(Some(first)).expect("memory").expect("a result");
     assert_eq!(digest(&second.view()), expected[1]);

@@ -3,17 +3,23 @@
 use crate::gpu::Gpu;
 use crate::network::{self, Matrices, Stage};
 use crate::ops::Matrix;
-use crate::{Failure, operations, operations_i8};
+use crate::{Failure, network_i8, operations, operations_i8};
 use safetensors::{Dtype, SafeTensors};
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use voxcast::calibrate::Calibrator;
 use voxcast::checkpoint::Checkpoint;
 use voxcast::container::{self, Data, Layout};
-use voxcast::import::Source;
+use voxcast::graph::Rewrites;
+use voxcast::import::{Integers, Source, import_int8_to_bytes, import_to_bytes};
+use voxcast::model::Options;
+use voxcast::model::ranges::Ranges;
 use voxcast::scene::{Image, Scene};
-use voxcast::{Network, weights::Precision};
+use voxcast::weights::Precision;
+use voxcast::{Isa, Model, Network, Threads};
 
 #[path = "../../support/scene.rs"]
 mod scene;
@@ -118,6 +124,59 @@ impl Case {
     /// The reference's own matrices, as stages.
     pub fn matrices(&self, gpu: &Gpu) -> Matrices {
         crate::projection::matrices(gpu, &self.network, &self.scene.lidar2img)
+    }
+
+    /// Where the ranges lie from which the case's int8 model is made, if it has one.
+    fn ranges(&self) -> PathBuf {
+        self.directory.join("ranges.json")
+    }
+
+    /// Whether it has an int8 model.
+    pub fn has_i8(&self) -> bool {
+        self.ranges().is_file()
+    }
+
+    /// The expected stages of the int8 model.
+    ///
+    /// # Errors
+    /// If the file is missing or malformed.
+    pub fn expected_i8(&self) -> Result<Vec<Stage>, Failure> {
+        read_stages(&self.expected_i8_path())
+    }
+
+    fn expected_i8_path(&self) -> PathBuf {
+        self.directory.join("expected_i8.safetensors")
+    }
+
+    /// Runs the int8 model, with the matrices among `stages`.
+    ///
+    /// # Errors
+    /// If the ranges or the weights do not fit the network, or matrices are missing.
+    pub fn run_i8(&self, gpu: &Gpu, stages: &[Stage]) -> Result<Vec<Stage>, Failure> {
+        let ranges = Ranges::open(&self.ranges(), &self.network)?;
+        let integers = Integers { rewrites: Rewrites::ALL, ranges: &ranges, keep_f32: &[] };
+        let bytes = import_int8_to_bytes(&*self.weights, &self.network, &integers, &mut |_, _| ())?;
+        let model = Model::from_bytes(bytes)?;
+        network_i8::run(gpu, &model, &*self.weights, &self.scene, Some(matrices(stages)?))
+    }
+
+    /// Measures ranges on the case's scene if there are none, computes the expected stages of the int8 model anew and writes
+    /// them, but for the matrices, which are those of the case.
+    ///
+    /// # Errors
+    /// As [`Case::run_i8`]; failed writes.
+    pub fn bless_i8(&self, gpu: &Gpu) -> Result<(), Failure> {
+        if !self.has_i8() {
+            let options = Options { precision: Precision::F32, rewrites: Rewrites::ALL };
+            let bytes = import_to_bytes(&*self.weights, &self.network, options, &mut |_, _| ())?;
+            let model = Arc::new(Model::from_bytes(bytes)?);
+            let mut calibrator = Calibrator::new(model, Isa::best(), &Threads::new(1)?)?;
+            calibrator.see(&self.scene)?;
+            calibrator.ranges()?.save(&self.ranges())?;
+        }
+        let mut stages = self.run_i8(gpu, &self.expected()?)?;
+        stages.retain(|s| !s.name.contains(".csr_"));
+        write_stages(&self.expected_i8_path(), &stages)
     }
 
     /// Computes the expected stages anew and writes them, but for those of `left_out`, which are large.

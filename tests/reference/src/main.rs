@@ -100,6 +100,11 @@ fn bless() -> Result<bool, Failure> {
         let before = case.expected().ok();
         case.bless(&gpu, &left_out.collect::<Vec<_>>())?;
         report(&case.name, &case.expected()?, before.as_deref());
+        if entry["int8"].as_bool() == Some(true) {
+            let before = case.expected_i8().ok();
+            case.bless_i8(&gpu)?;
+            report(&format!("{} in 8 bits", case.name), &case.expected_i8()?, before.as_deref());
+        }
     }
     manifest["adapter"] = gpu.adapter().into();
     manifest["driver"] = gpu.driver().into();

@@ -10,7 +10,7 @@ mod table;
 #[path = "../../support/operations_i8.rs"]
 pub(crate) mod table_i8;
 
-use table::{After, Case, Kind};
+use table::{After, Case, Kind, OFFSETS, QUERY_TAPS};
 
 /// Every case's name and result, channels first; logits are channels last.
 pub fn results(gpu: &Gpu) -> Vec<(&'static str, Vec<f32>)> {
@@ -38,7 +38,7 @@ fn result(gpu: &Gpu, case: &Case) -> Vec<f32> {
         }
         Kind::DeformConv { height, width, inputs, outputs, reach } => {
             let extent = [1, height, width];
-            let offsets = Tensor::new(gpu, extent, 27, &case.offsets(height * width, reach));
+            let offsets = Tensor::new(gpu, extent, OFFSETS, &case.offsets(height * width, reach));
             ops::deform_conv(gpu, &tensor("x", extent, inputs), &offsets, &weights("weight", outputs * inputs * 9))
         }
         Kind::Depthwise { height, width, channels, side } => {
@@ -117,7 +117,7 @@ fn attention(gpu: &Gpu, case: &Case, plane: [usize; 2], heads: usize, part: usiz
     let weights: Vec<HeadWeights> = (0..heads)
         .map(|i| HeadWeights {
             qkv: pair(format!("qkv.{i}"), 3 * part * part, 3 * part),
-            query: pair(format!("query.{i}"), part * 25, part),
+            query: pair(format!("query.{i}"), part * QUERY_TAPS, part),
             offsets: gpu.upload(&case.numbers(&format!("offsets.{i}"), side * side)),
         })
         .collect();

@@ -106,11 +106,14 @@ pub fn conv(gpu: &Gpu, x: &Tensor, walk: &Walk, weight: &Buffer, bias: Option<&B
     Tensor::of(output, outputs, buffer)
 }
 
-/// `weight` is `[outputs, inputs, 3, 3]`, `offsets` has 27 channels.
+/// Taps of a deformable convolution.
+const TAPS: usize = 3 * 3;
+
+/// `weight` is `[outputs, inputs, 3, 3]`, `offsets` has three channels per tap.
 pub fn deform_conv(gpu: &Gpu, x: &Tensor, offsets: &Tensor, weight: &Buffer) -> Tensor {
     let [_, height, width] = x.extent;
-    assert!(offsets.extent == x.extent && offsets.channels == 27, "offsets of another shape");
-    let outputs = weight.len() / (9 * x.channels);
+    assert!(offsets.extent == x.extent && offsets.channels == 3 * TAPS, "offsets of another shape");
+    let outputs = weight.len() / (TAPS * x.channels);
     let inputs = [&x.buffer, &offsets.buffer, weight];
     let shape = words([x.channels, outputs, height, width]);
     Tensor::of(x.extent, outputs, gpu.run("deform_conv", &shape, &inputs, outputs * height * width))

@@ -66,6 +66,29 @@ fn networks_are_regenerated() {
     }
 }
 
+/// Every stage of integers, the logits and the classes are equal; what stays in f32 is within the tolerance of f32.
+#[test]
+fn networks_in_integers_are_regenerated_without_tolerance() {
+    let own = cases::own();
+    let tolerance = Tolerance::named(&cases::manifest(&own).unwrap(), "f32").unwrap();
+    let gpu = gpu();
+    let cases: Vec<Case> = Case::listed(&own).unwrap().into_iter().filter(Case::has_i8).collect();
+    assert!(cases.len() >= 2);
+    for case in cases {
+        let expected = case.expected_i8().unwrap();
+        let found = case.run_i8(&gpu, &case.expected().unwrap()).unwrap();
+        let [floats, equal]: [Vec<Stage>; 2] = [true, false].map(|float| {
+            let is_float = |s: &&Stage| s.dtype == safetensors::Dtype::F32 && !s.name.starts_with("logits.");
+            expected.iter().filter(|s| is_float(s) == float).cloned().collect()
+        });
+        assert!(equal.len() > 30, "{}: {} stages of integers show little", case.name, equal.len());
+        for (expected, tolerance) in [(floats, tolerance), (equal, Tolerance::NONE)] {
+            let rows = cases::compare(&found, &expected, tolerance).unwrap();
+            assert!(rows.iter().all(|row| row.fits), "{}", table(&case.name, &rows));
+        }
+    }
+}
+
 #[test]
 fn networks_agree_with_pytorch() {
     let golden = cases::golden();

@@ -52,7 +52,7 @@ fn panels(weights: &[i8], depth: usize) -> impl Iterator<Item = &[[[i8; GROUP]; 
 pub fn sums(weights: &[i8], depth: usize) -> impl Iterator<Item = i32> {
     panels(weights, depth).flat_map(|groups| {
         let mut sums = [0i32; LANES];
-        for (sum, w) in groups.iter().flat_map(|group| sums_of(group)).enumerate() {
+        for (sum, w) in groups.iter().flat_map(sums_of).enumerate() {
             sums[sum % LANES] = sums[sum % LANES].wrapping_add(w);
         }
         sums

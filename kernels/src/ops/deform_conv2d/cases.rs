@@ -67,7 +67,8 @@ fn bench(name: &str, [h, w]: [usize; 2], width: usize) -> Bench {
         output: [1, h, w],
     };
     let (rows, depth) = (geometry.rows(), geometry.depth());
-    let (input, offsets) = (values(rows * width, 1.0), values(rows * 27, 3.0));
+    let taps = depth / width;
+    let (input, offsets) = (values(rows * width, 1.0), values(rows * 3 * taps, 3.0));
     let (weights, bias) = (values(packed_len(depth, width), 1.0 / depth as f32), values(width, 1.0));
     let mut scratch = values(SCRATCH, 0.0);
     let read = 4 * (input.len() + offsets.len() + weights.len());

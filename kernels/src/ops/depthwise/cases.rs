@@ -1,7 +1,7 @@
 //! [`super::depthwise()`] with any arguments, and at the network's shapes.
 
 use super::{Depthwise, depthwise};
-use crate::cases::{Bench, Case, Draw, MAX_WORK, Memory, Output, values};
+use crate::cases::{Bench, Case, Draw, Exact, MAX_WORK, Memory, Output, values};
 use crate::isa::Isa;
 use std::ops::Range;
 use std::vec::Vec;
@@ -42,6 +42,27 @@ impl Case for Call {
         let args = Depthwise { input, height, width, channels, kernel, weights, bias, residual };
         depthwise(isa, &args, self.rows.clone(), &mut out);
         Output::from(&out[..])
+    }
+
+    fn exact(&self) -> Option<Exact> {
+        let [height, width, channels] = self.shape;
+        let (half, padded) = (self.kernel / 2, channels.next_multiple_of(16));
+        let mut values = Vec::new();
+        for (y, x, c) in
+            self.rows.clone().flat_map(|y| (0..width).flat_map(move |x| (0..channels).map(move |c| (y, x, c))))
+        {
+            let mut sum = f64::from(self.bias[c]);
+            for (ky, kx) in (0..self.kernel).flat_map(|ky| (0..self.kernel).map(move |kx| (ky, kx))) {
+                let inside = |at: usize, size: usize| at.checked_sub(half).filter(|&at| at < size);
+                if let (Some(y), Some(x)) = (inside(y + ky, height), inside(x + kx, width)) {
+                    let weight = self.weights[(ky * self.kernel + kx) * padded + c];
+                    sum += f64::from(weight) * f64::from(self.input[(y * width + x) * channels + c]);
+                }
+            }
+            let residual = if self.residual { f64::from(self.input[(y * width + x) * channels + c]) } else { 0.0 };
+            values.push(sum + residual);
+        }
+        Some(Exact { values, tolerance: 1e-5 })
     }
 }
 

@@ -1,7 +1,7 @@
 //! [`super::gate()`] with any arguments, and at the network's shapes.
 
 use super::{Gate, gate};
-use crate::cases::{Bench, Case, Draw, Memory, Output, values};
+use crate::cases::{Bench, Case, Draw, Exact, Memory, Output, values};
 use crate::isa::Isa;
 use std::vec;
 use std::vec::Vec;
@@ -30,6 +30,17 @@ impl Case for Call {
         let (depth, channels, bias) = (self.depth, self.channels, self.bias);
         gate(isa, &Gate { bev: &bev, depth, channels, weights: &weights, bias }, &mut volume);
         Output::from(&volume[..])
+    }
+
+    fn exact(&self) -> Option<Exact> {
+        let (depth, channels) = (self.depth, self.channels);
+        let value = |(i, &volume): (usize, &f32)| {
+            let voxel = &self.volume[i / channels * channels..][..channels];
+            let products = voxel.iter().zip(&self.weights).map(|(x, w)| f64::from(*x) * f64::from(*w));
+            let gate = 1.0 / (1.0 + (-(products.sum::<f64>() + f64::from(self.bias))).exp());
+            f64::from(volume) + gate * f64::from(self.bev[i / (channels * depth) * channels + i % channels])
+        };
+        Some(Exact { values: self.volume.iter().enumerate().map(value).collect(), tolerance: 1e-6 })
     }
 }
 

@@ -1,7 +1,7 @@
 //! [`super::gather()`] with any arguments, and at the network's shapes.
 
 use super::{Gather, Mask, gather};
-use crate::cases::{Bench, Case, Draw, Memory, Output, values};
+use crate::cases::{Bench, Case, Draw, Exact, Memory, Output, values};
 use crate::isa::Isa;
 use std::ops::Range;
 use std::vec;
@@ -74,6 +74,22 @@ impl Case for Call {
         };
         gather(isa, &args, entries.rows.clone(), &mut out);
         Output::from(&out[..])
+    }
+
+    fn exact(&self) -> Option<Exact> {
+        let kept = |col: &&u32| self.masked.as_ref().is_none_or(|m| !m[**col as usize / self.per_camera]);
+        let mut values = Vec::new();
+        for row in self.rows.clone() {
+            let cols = &self.col[self.ptr[row] as usize..self.ptr[row + 1] as usize];
+            let pixels: Vec<usize> = cols.iter().filter(kept).map(|&col| col as usize).collect();
+            for c in 0..self.channels {
+                let feature = |pixel: &usize| f64::from(self.features[pixel * self.stride + self.first_channel + c]);
+                let mean = pixels.iter().map(feature).sum::<f64>() / pixels.len().max(1) as f64;
+                let value = mean + self.bias.as_ref().map_or(0.0, |bias| f64::from(bias[c]));
+                values.push(if self.relu { value.max(0.0) } else { value });
+            }
+        }
+        Some(Exact { values, tolerance: 1e-6 })
     }
 }
 

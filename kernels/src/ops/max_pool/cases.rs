@@ -1,7 +1,7 @@
 //! [`super::max_pool()`] with any arguments, and at the network's shapes.
 
 use super::{MaxPool, max_pool};
-use crate::cases::{Bench, Case, Draw, Memory, Output, values};
+use crate::cases::{Bench, Case, Draw, Exact, Memory, Output, values};
 use crate::isa::Isa;
 use std::ops::Range;
 use std::vec;
@@ -37,6 +37,27 @@ impl Case for Call {
         let mut out = memory.filled(self.rows.len() * args.output()[1] * args.channels, f32::NAN);
         max_pool(isa, &args, self.rows.clone(), &mut out);
         Output::from(&out[..])
+    }
+
+    fn exact(&self) -> Option<Exact> {
+        let ([height, width, channels], [kernel, stride, padding]) = (self.shape, self.window);
+        let mut padded = vec![f64::NEG_INFINITY; (height + 2 * padding) * (width + 2 * padding) * channels];
+        let place = |y: usize, x: usize, c: usize| (y * (width + 2 * padding) + x) * channels + c;
+        for (i, &v) in self.input.iter().enumerate() {
+            let (y, x, c) = (i / channels / width, i / channels % width, i % channels);
+            padded[place(y + padding, x + padding, c)] = f64::from(v);
+        }
+        let mut values = Vec::new();
+        for y in self.rows.clone().map(|row| row * stride) {
+            for x in (0..=width + 2 * padding - kernel).step_by(stride) {
+                let taps = (y..y + kernel).flat_map(|y| (x..x + kernel).map(move |x| (y, x)));
+                values.extend(
+                    (0..channels)
+                        .map(|c| taps.clone().map(|(y, x)| padded[place(y, x, c)]).fold(f64::NEG_INFINITY, f64::max)),
+                );
+            }
+        }
+        Some(Exact { values, tolerance: 0.0 })
     }
 }
 

@@ -1,7 +1,7 @@
 //! [`super::mean()`] with any arguments, and at the network's shapes.
 
 use super::{Mean, broadcast, mean};
-use crate::cases::{Bench, Case, Draw, Memory, Output, values};
+use crate::cases::{Bench, Case, Draw, Exact, Memory, Output, values};
 use crate::isa::Isa;
 use std::vec;
 use std::vec::Vec;
@@ -29,6 +29,16 @@ impl Case for Call {
         mean(isa, &Mean { input: &input, channels: self.channels }, &mut row);
         broadcast(&row, self.stride, self.offset, &mut out);
         Output::from(&out[..])
+    }
+
+    fn exact(&self) -> Option<Exact> {
+        let rows = self.input.len() / self.channels;
+        let sum = |c: usize| self.input.iter().skip(c).step_by(self.channels).map(|&v| f64::from(v)).sum::<f64>();
+        let value = |(i, &before): (usize, &f32)| {
+            let channel = (i % self.stride).checked_sub(self.offset).filter(|&c| c < self.channels);
+            channel.map_or(f64::from(before), |c| sum(c) / rows as f64)
+        };
+        Some(Exact { values: self.before.iter().enumerate().map(value).collect(), tolerance: 1e-6 })
     }
 }
 

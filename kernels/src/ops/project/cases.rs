@@ -42,10 +42,16 @@ impl Case for Call {
     }
 }
 
-/// The sample points of a column of level 1 of `nuscenes-200`, over and over. A pixel takes two divisions and nine
+/// The sample points of a column of each level of `nuscenes-200`, over and over. A pixel takes two divisions and nine
 /// multiply-adds.
 pub(crate) fn benches() -> Vec<Bench> {
-    let (columns, n, depth) = (1000, 4, 32);
+    let levels = [("level1 columns", 4, 32), ("level2 columns", 5, 20), ("level3 columns", 6, 12)];
+    levels.map(|(name, samples, depth)| bench(name, samples, depth)).into()
+}
+
+/// Columns of `samples` x and y, and `depth` z.
+fn bench(name: &str, samples: usize, depth: usize) -> Bench {
+    let columns = 1000;
     let projection = Projection {
         matrix: [160.0, 0.0, 160.0, 0.0, 0.0, 160.0, 80.0, 0.0, 0.0, 0.0, 1.0, 2.0],
         sum: Sum::Chain,
@@ -54,13 +60,13 @@ pub(crate) fn benches() -> Vec<Bench> {
         stride_log2: 3,
         base: 1,
     };
-    let (xs, zs) = (values(n, 1.0), values(depth, 1.0));
-    let each = n * n * depth;
+    let (xs, zs) = (values(samples, 1.0), values(depth, 1.0));
+    let each = samples * samples * depth;
     let mut found = vec![0; each];
-    vec![Bench::new("level1 columns", [columns, 1], 9 * each, columns * 4 * each, move |isa, columns, out| {
+    Bench::new(name, [columns, 1], 9 * each, columns * 4 * each, move |isa, columns, out| {
         for (_, out) in columns.zip(out) {
             project_points(isa, &projection, &xs, &xs, &zs, &mut found);
             *out = found.iter().fold(0, |sum: u32, pixel| sum.wrapping_add(*pixel)) as f32;
         }
-    })]
+    })
 }

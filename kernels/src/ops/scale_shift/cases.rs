@@ -1,7 +1,7 @@
 //! [`super::scale_shift()`] with any arguments, and at the network's shapes.
 
 use super::{ScaleShift, scale_shift};
-use crate::cases::{Bench, Case, Draw, Memory, Output, values};
+use crate::cases::{Bench, Case, Draw, Exact, Memory, Output, values};
 use crate::isa::Isa;
 use std::vec;
 use std::vec::Vec;
@@ -52,6 +52,19 @@ impl Case for Call {
         };
         scale_shift(isa, &args, &mut rows);
         Output::from(&rows[..])
+    }
+
+    fn exact(&self) -> Option<Exact> {
+        let value = |(i, &before): (usize, &f32)| {
+            let channel = (i % self.stride).checked_sub(self.first_channel).filter(|&c| c < self.channels);
+            let Some(c) = channel else { return f64::from(before) };
+            let [x, scale, shift] = [before, self.scale[c], self.shift[c]].map(f64::from);
+            let residual = self.residual.as_ref().map_or(0.0, |residual| f64::from(residual[i]));
+            let [sooner, later] = if self.residual_after { [0.0, residual] } else { [residual, 0.0] };
+            let sum = x * scale + shift + sooner;
+            later + if self.relu { sum.max(0.0) } else { sum }
+        };
+        Some(Exact { values: self.before.iter().enumerate().map(value).collect(), tolerance: 3e-7 })
     }
 }
 

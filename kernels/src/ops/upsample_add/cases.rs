@@ -1,7 +1,7 @@
 //! [`super::upsample_add()`] with any arguments, and at the network's shapes.
 
 use super::{UpsampleAdd, upsample_add};
-use crate::cases::{Bench, Case, Draw, Memory, Output, values};
+use crate::cases::{Bench, Case, Draw, Exact, Memory, Output, values};
 use crate::isa::Isa;
 use std::ops::Range;
 use std::vec;
@@ -31,6 +31,18 @@ impl Case for Call {
         let args = UpsampleAdd { low: &low, low_height, low_width, height, width, channels };
         upsample_add(isa, &args, self.rows.clone(), &mut out);
         Output::from(&out[..])
+    }
+
+    fn exact(&self) -> Option<Exact> {
+        let ([low_height, low_width], [height, width], channels) = (self.low, self.high, self.channels);
+        let nearest =
+            |at: usize, low: usize, high: usize| (at as f64 * low as f64 / high as f64 + 1e-9).floor() as usize;
+        let value = |(i, &before): (usize, &f32)| {
+            let (y, x, c) = (self.rows.start + i / channels / width, i / channels % width, i % channels);
+            let at = nearest(y, low_height, height) * low_width + nearest(x, low_width, width);
+            f64::from(before) + f64::from(self.input[at * channels + c])
+        };
+        Some(Exact { values: self.before.iter().enumerate().map(value).collect(), tolerance: 1e-7 })
     }
 }
 

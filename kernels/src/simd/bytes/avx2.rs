@@ -3,7 +3,7 @@
 
 use super::{Form, GROUP, STEP};
 use crate::isa::Avx2;
-use crate::simd::TileRows;
+use crate::simd::{LANES, TileRows};
 use core::arch::asm;
 use core::arch::x86_64::*;
 
@@ -90,7 +90,7 @@ unsafe fn twos<const SIGNED: bool>(a: __m256i, w: __m256i, magnitude: __m256i) -
 #[inline(always)]
 unsafe fn magnitudes<const SIGNED: bool>(w: Sums) -> Sums {
     // SAFETY: the caller promises AVX2.
-    if SIGNED { w.map(|w| unsafe { _mm256_abs_epi8(w) }) } else { w }
+    if SIGNED { unsafe { [_mm256_abs_epi8(w[0]), _mm256_abs_epi8(w[1])] } } else { w }
 }
 
 /// Each group widened by itself.
@@ -142,7 +142,7 @@ unsafe fn pairs<const N: usize, const P: usize, const SIGNED: bool>(
         let ones = _mm256_set1_epi16(1);
         for k in (0..even).step_by(2 * GROUP) {
             for j in 0..P {
-                let panel = panels[j].add(k * super::super::LANES);
+                let panel = panels[j].add(k * LANES);
                 let (w, next) = (load(panel), load(panel.add(STEP)));
                 let (magnitude, next_magnitude) = (magnitudes::<SIGNED>(w), magnitudes::<SIGNED>(next));
                 for r in 0..N {
@@ -159,8 +159,7 @@ unsafe fn pairs<const N: usize, const P: usize, const SIGNED: bool>(
             }
         }
         if even < depth {
-            let (left, panels) =
-                (left.map(|left| left.add(even)), panels.map(|panel| panel.add(even * super::super::LANES)));
+            let (left, panels) = (left.map(|left| left.add(even)), panels.map(|panel| panel.add(even * LANES)));
             sums = plain::<N, P, SIGNED>(left, panels, depth - even, sums);
         }
     }
@@ -183,13 +182,13 @@ unsafe fn dot<const N: usize, const P: usize, const SIGNED: bool>(
     unsafe {
         let shift = _mm256_set1_epi8(i8::MIN);
         for group in 0..depth / GROUP {
-            let w = panels.map(|panel| load(panel.add(group * STEP)));
-            for r in 0..N {
-                let a = splat(left[r].add(group * GROUP));
-                let a = if SIGNED { _mm256_xor_si256(a, shift) } else { a };
-                for j in 0..P {
+            for j in 0..P {
+                let w = load(panels[j].add(group * STEP));
+                for r in 0..N {
+                    let a = splat(left[r].add(group * GROUP));
+                    let a = if SIGNED { _mm256_xor_si256(a, shift) } else { a };
                     for half in 0..2 {
-                        sums[r][j][half] = dpbusd(sums[r][j][half], a, w[j][half]);
+                        sums[r][j][half] = dpbusd(sums[r][j][half], a, w[half]);
                     }
                 }
             }

@@ -72,6 +72,23 @@ impl Weights {
         }
     }
 
+    /// The same of each panel, from byte `at` on.
+    ///
+    /// # Safety
+    /// As [`Weights::load`], for each panel.
+    #[inline(always)]
+    unsafe fn group<const P: usize>(panels: [*const i8; P], at: usize) -> [Self; P] {
+        // SAFETY: the caller's promise is passed on.
+        unsafe {
+            // Not by closures: those have no instructions enabled.
+            let mut w = [Self::load(panels[0].add(at)); P];
+            for j in 1..P {
+                w[j] = Self::load(panels[j].add(at));
+            }
+            w
+        }
+    }
+
     /// Sums of two products in 16 bits. Of signed elements the sign is moved from the weights: |w| * (a * sign(w)).
     ///
     /// # Safety
@@ -105,7 +122,7 @@ unsafe fn plain<const N: usize, const P: usize, const SIGNED: bool>(
     unsafe {
         let ones = _mm512_set1_epi16(1);
         for group in 0..depth / GROUP {
-            let w = panels.map(|panel| Weights::load(panel.add(group * STEP)));
+            let w = Weights::group(panels, group * STEP);
             for r in 0..N {
                 let a = splat(left[r].add(group * GROUP));
                 for j in 0..P {
@@ -134,8 +151,8 @@ unsafe fn pairs<const N: usize, const P: usize, const SIGNED: bool>(
     unsafe {
         let ones = _mm512_set1_epi16(1);
         for k in (0..even).step_by(2 * GROUP) {
-            let w = panels.map(|panel| Weights::load(panel.add(k * LANES)));
-            let next = panels.map(|panel| Weights::load(panel.add(k * LANES + STEP)));
+            let w = Weights::group(panels, k * LANES);
+            let next = Weights::group(panels, k * LANES + STEP);
             for r in 0..N {
                 let (a, b) = (splat(left[r].add(k)), splat(left[r].add(k + GROUP)));
                 for j in 0..P {
@@ -168,12 +185,12 @@ unsafe fn dot<const N: usize, const P: usize, const SIGNED: bool>(
     unsafe {
         let shift = _mm512_set1_epi8(i8::MIN);
         for group in 0..depth / GROUP {
-            let w = panels.map(|panel| _mm512_loadu_si512(panel.add(group * STEP).cast()));
+            let w = Weights::group(panels, group * STEP);
             for r in 0..N {
                 let a = splat(left[r].add(group * GROUP));
                 let a = if SIGNED { _mm512_xor_si512(a, shift) } else { a };
                 for j in 0..P {
-                    sums[r][j] = dpbusd(sums[r][j], a, w[j]);
+                    sums[r][j] = dpbusd(sums[r][j], a, w[j].0);
                 }
             }
         }

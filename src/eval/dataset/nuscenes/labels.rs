@@ -47,6 +47,16 @@ pub(super) fn read_occ3d(path: &Path) -> Result<(Vec<u8>, Vec<Vec<u8>>)> {
 /// Classes of OpenOcc v2 in the order of [`CLASSES`], by the number that its labels give them; the last is free.
 const OPENOCC: [u8; 17] = [4, 10, 9, 3, 5, 2, 6, 7, 8, 1, 11, 12, 13, 14, 15, 16, 0];
 
+/// The number that OpenOcc's labels give a class.
+///
+/// # Panics
+/// If there is no such class.
+pub(super) fn openocc_label(class: u8) -> u8 {
+    let label = OPENOCC.iter().position(|&known| known == class);
+    assert!(label.is_some(), "class {class}, expected one of {}", OPENOCC.len());
+    label.unwrap_or(0) as u8
+}
+
 /// Labels of OpenOcc v2: `semantics` of Occ3D's grid, in an order of its own. The flow is not read.
 ///
 /// # Errors

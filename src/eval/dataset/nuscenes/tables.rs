@@ -2,7 +2,7 @@
 //! frames need a tenth; so rows are read one by one, and what is not needed is dropped at once.
 
 use super::super::{Pose, is_inside};
-use super::{CAMERAS, Camera, Entry, LIDAR, Scenes};
+use super::{CAMERAS, CameraImage, Entry, LIDAR, Scenes};
 use crate::base::error::{Error, Result};
 use crate::scene::check_finite;
 use crate::scene::matrix::check_intrinsic;
@@ -123,7 +123,7 @@ impl Tables<'_> {
         let path = self.path(table);
         let file = File::open(&path).map_err(|e| Error::io(&path, "open", &e))?;
         let mut json = serde_json::Deserializer::from_reader(BufReader::with_capacity(1 << 18, file));
-        let mut rows = Rows { row, failed: None, kind: PhantomData };
+        let mut rows = EachRow { row, failed: None, kind: PhantomData };
         let parsed = (&mut rows).deserialize(&mut json).and_then(|()| json.end());
         match (rows.failed, parsed) {
             (Some(error), _) => Err(error.in_file(&path)),
@@ -263,10 +263,10 @@ fn entry(
         let lidar_to_camera = (ego * mount.to_ego).inverse() * lidar_to_global;
         let lidar2img = lidar_to_camera.then_project(&rows);
         check_finite(name, &lidar2img).map_err(|e| of_row(&camera.token, &e))?;
-        seen.push(Camera { filename: camera.filename, size: camera.size, lidar2img });
+        seen.push(CameraImage { filename: camera.filename, size: camera.size, lidar2img });
     }
     let id = format!("{}/{}", sample.scene, sample.token);
-    Ok(Entry { id, lidar: lidar.filename, cameras: seen, lidar_to_ego: lidar_mount.to_ego })
+    Ok(Entry { id, lidar: lidar.filename, cameras: seen, lidar_to_ego: lidar_mount.to_ego, lidar_to_global })
 }
 
 fn intrinsic(rows: &[Vec<f64>]) -> Result<[[f64; 3]; 3]> {
@@ -310,14 +310,14 @@ fn of_row(token: &str, error: &Error) -> Error {
 }
 
 /// Hands on the rows of a list as they are read.
-struct Rows<T, F> {
+struct EachRow<T, F> {
     row: F,
     /// Why the reading was broken off.
     failed: Option<Error>,
     kind: PhantomData<T>,
 }
 
-impl<'de, T: DeserializeOwned, F: FnMut(T) -> Result<()>> DeserializeSeed<'de> for &mut Rows<T, F> {
+impl<'de, T: DeserializeOwned, F: FnMut(T) -> Result<()>> DeserializeSeed<'de> for &mut EachRow<T, F> {
     type Value = ();
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> std::result::Result<(), D::Error> {
@@ -325,7 +325,7 @@ impl<'de, T: DeserializeOwned, F: FnMut(T) -> Result<()>> DeserializeSeed<'de> f
     }
 }
 
-impl<'de, T: DeserializeOwned, F: FnMut(T) -> Result<()>> Visitor<'de> for &mut Rows<T, F> {
+impl<'de, T: DeserializeOwned, F: FnMut(T) -> Result<()>> Visitor<'de> for &mut EachRow<T, F> {
     type Value = ();
 
     fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {

@@ -1,3 +1,4 @@
+use super::super::Frame;
 use super::*;
 use crate::file::npz::{Array, Elements, write_npz};
 use crate::image::png::write_rgb_png;
@@ -63,15 +64,15 @@ impl Place {
 #[test]
 fn frames_labels_and_cameras() {
     let place = Place::new();
-    place.labels("000/007", &[(3, 0), (4, 14), (5, 23), (VOXELS - 1, 2)], [&[3], &[4, 5], &[6]], "infov");
+    place.labels("000/007", &[(3, 0), (4, 14), (5, 23), (VOXELS - 1, 2)], [&[3], &[4, 5], &[5, 6]], "infov");
     let set = place.open().expect("a set");
     assert_eq!((set.len(), set.id(0), set.id(1)), (2, "000/007", "001/000"));
-    let Frame { scene, truth } = set.frame(0).expect("a frame");
+    let Frame { scene, truth, .. } = set.frame(0).expect("a frame");
     let mut expected = vec![0u8; VOXELS];
     (expected[3], expected[4], expected[VOXELS - 1]) = (1, 15, 3);
     assert!(truth.labels == expected);
     let inside = truth.masks.iter().map(|mask| (0..10).filter(|&at| mask[at] == 1).collect::<Vec<_>>());
-    assert_eq!(inside.collect::<Vec<_>>(), [vec![3], vec![4, 5], vec![6]]);
+    assert_eq!(inside.collect::<Vec<_>>(), [vec![3], vec![4, 5], vec![5, 6], vec![5]]);
     assert_eq!(scene.names, CAMERAS);
     for camera in 0..5 {
         assert_eq!(scene.images[camera].bgr[0], camera as u8);

@@ -1,5 +1,6 @@
 use super::*;
 use crate::base::error::ErrorKind;
+use crate::base::pose::Pose;
 use crate::image::png::write_rgb_png;
 use std::fs;
 

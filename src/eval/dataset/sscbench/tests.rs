@@ -98,8 +98,8 @@ fn what_is_missing_or_malformed_is_named() {
         PERSPECTIVE.replace("R_rect_00: 1", "R_rect_00: nan").as_bytes(),
         "\"nan\", expected a finite",
     );
-    opening("calibration/calib_cam_to_velo.txt", b"1 0 0 0 0 2 0 0 0 0 1 0", "no rotation");
-    opening("calibration/calib_cam_to_velo.txt", b"1 0 0 0 0 -1 0 0 0 0 1 0", "no rotation");
+    opening("calibration/calib_cam_to_velo.txt", b"1 0 0 0 0 2 0 0 0 0 1 0", "scaled: row 1");
+    opening("calibration/calib_cam_to_velo.txt", b"1 0 0 0 0 -1 0 0 0 0 1 0", "mirrored");
     let labels = format!("preprocess/labels/{DRIVE}/000000_1_1.npy");
     for (bytes, expected) in [
         (npy("(256, 32, 256)", &[0; 256 * 256 * 32]), "shape [256, 32, 256], expected [256, 256, 32]"),

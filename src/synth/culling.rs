@@ -72,7 +72,7 @@ impl<T: Copy> Lists<T> {
 }
 
 /// What one camera can see of a world, tile by tile.
-pub(super) struct Sight<'a> {
+pub(super) struct Culling<'a> {
     world: &'a World,
     origin: Vec3,
     /// Columns and rows of tiles.
@@ -96,7 +96,7 @@ struct Slot {
     to: u32,
 }
 
-impl<'a> Sight<'a> {
+impl<'a> Culling<'a> {
     pub(super) fn new(world: &'a World, camera: &Pinhole) -> Self {
         let [height, width] = camera.size;
         let tiles = [width.div_ceil(TILE), height.div_ceil(TILE)];

@@ -1,19 +1,19 @@
-//! A pickle machine (protocols 2 to 5) that builds tensors and plain containers, and can do nothing else.
+//! A pickle machine (protocols 2 to 5) that builds plain values and what its [`Vocabulary`] knows, and can do nothing else.
 //!
-//! Where Python's machine would import and call, this one looks the name up in [`globals`], a closed list
-//! of constructions that it performs itself or skips; any other name is refused. A name that is only *mentioned* is kept
-//! as a name, for nothing here can resolve it.
+//! Where Python's machine would import and call, this one asks the vocabulary, a closed list of constructions that are
+//! performed here or skipped; any other name is refused. A name that is only *mentioned* is kept as a name, for nothing here
+//! can resolve it.
 //!
 //! Values lie in one vector and refer to each other by index, so that neither deep nor cyclic data costs any stack, here
 //! or when they are dropped. An instruction makes a few values at most, each stack slot is moved into at most one
 //! container, and strings stay in the input: memory is a small multiple of the input's length, whatever lengths it
 //! declares.
 
-mod calls;
+#[cfg(feature = "eval")]
+pub(crate) mod numpy;
 
-use super::globals;
-use super::tensor::Element;
 use crate::base::error::{Error, ErrorKind, Result};
+use std::fmt::Debug;
 
 /// Most values that are built. A tensor takes about twenty, so this is room for some 400,000 of them.
 const MAX_VALUES: usize = 1 << 23;
@@ -23,22 +23,60 @@ const MAX_BYTES: usize = 1 << 30;
 
 /// A value, as an index into those of its [`Pickle`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub(super) struct Id(u32);
+pub(crate) struct Id(u32);
 
 /// Some bytes of the input.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Text {
+pub(crate) struct Text {
     start: u32,
     len: u32,
 }
 
+/// What a pickle may call, and what that builds.
+pub(crate) trait Vocabulary: Sized + Debug {
+    /// What calls and persistent ids build, beside plain values.
+    type Object: Debug;
+
+    /// What can be called.
+    type Callable;
+
+    /// What may be built, for the message that something else is refused.
+    const ALLOWED: &'static str;
+
+    /// The word for an object in messages.
+    fn kind(object: &Self::Object) -> &'static str;
+
+    /// What `module.name` stands for where it is called; `None` for everything that is refused.
+    fn callable(module: &str, name: &str) -> Option<Self::Callable>;
+
+    /// The value that stands for `callable(*args)`, which messages call `name`. Of many arguments only the first
+    /// [`MAX_ARGUMENTS`] are given.
+    fn call(machine: &mut Machine<'_, Self>, callable: Self::Callable, name: &str, args: &[Id]) -> Result<Id>;
+
+    /// The object of a persistent id, which no call builds.
+    fn persistent(machine: &Machine<'_, Self>, id: Id) -> Result<Self::Object> {
+        let _ = id;
+        Err(machine.error("a persistent id, which only its writer can resolve"))
+    }
+
+    /// Sets the state of an object that it built.
+    fn set_state(machine: &mut Machine<'_, Self>, object: Id, state: Id) -> Result<()>;
+}
+
+/// Most arguments that a vocabulary sees: no construction looks at more.
+pub(crate) const MAX_ARGUMENTS: usize = 8;
+
 /// What a pickle can build.
 #[derive(Debug)]
-pub(super) enum Value {
+pub(crate) enum Value<V: Vocabulary> {
     None,
     Bool(bool),
     Int(i64),
+    #[cfg_attr(not(feature = "eval"), expect(dead_code, reason = "checkpoints have no use for floats"))]
+    Float(f64),
     Str(Text),
+    #[cfg_attr(not(feature = "eval"), expect(dead_code, reason = "nor for bytes"))]
+    Bytes(Text),
     Tuple(Box<[Id]>),
     List(Vec<Id>),
     /// In order of insertion; a key may come again, and hashing is left to those who look.
@@ -47,66 +85,41 @@ pub(super) enum Value {
         module: Text,
         name: Text,
     },
-    Storage(StorageRef),
-    Tensor(TensorRef),
+    Object(V::Object),
     /// Something that is never looked into, with the word for it.
     Inert(&'static str),
 }
 
-/// A storage that the pickle refers to.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct StorageRef {
-    pub(super) element: Element,
-    /// Name of its entry under `data/`.
-    pub(super) key: Text,
-    /// Length in elements.
-    pub(super) numel: u64,
-}
-
-/// A tensor as the pickle describes it. Only the types of the parts have been looked at.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct TensorRef {
-    /// A [`Value::Storage`].
-    pub(super) storage: Id,
-    /// That of the storage, unless that is untyped.
-    pub(super) element: Element,
-    pub(super) offset: i64,
-    pub(super) size: Id,
-    pub(super) stride: Id,
-}
-
-// Together with its place on the stack this is what one byte of input can cost, up to `MAX_VALUES` times.
-const _: () = assert!(size_of::<Value>() <= 32);
-
-impl Value {
+impl<V: Vocabulary> Value<V> {
     /// The word for it in messages.
-    pub(super) fn kind(&self) -> &'static str {
+    pub(crate) fn kind(&self) -> &'static str {
         match self {
             Value::None => "None",
             Value::Bool(_) => "a bool",
             Value::Int(_) => "an int",
+            Value::Float(_) => "a float",
             Value::Str(_) => "a string",
+            Value::Bytes(_) => "bytes",
             Value::Tuple(_) => "a tuple",
             Value::List(_) => "a list",
             Value::Dict(_) => "a dict",
             Value::Global { .. } => "a class or function",
-            Value::Storage(_) => "a storage",
-            Value::Tensor(_) => "a tensor",
+            Value::Object(object) => V::kind(object),
             Value::Inert(what) => what,
         }
     }
 }
 
 /// What a pickle built.
-pub(super) struct Pickle<'a> {
+pub(crate) struct Pickle<'a, V: Vocabulary> {
     bytes: &'a [u8],
-    values: Vec<Value>,
+    values: Vec<Value<V>>,
     root: Id,
 }
 
-impl<'a> Pickle<'a> {
+impl<'a, V: Vocabulary> Pickle<'a, V> {
     /// Runs the pickle that fills `bytes`, which messages call `what`.
-    pub(super) fn parse(bytes: &'a [u8], what: &'static str) -> Result<Self> {
+    pub(crate) fn parse(bytes: &'a [u8], what: &'static str) -> Result<Self> {
         if bytes.len() > MAX_BYTES {
             let message = format!("{what} has {} bytes, expected at most {MAX_BYTES}", bytes.len());
             return Err(Error::new(ErrorKind::TooLarge, message));
@@ -120,7 +133,7 @@ impl<'a> Pickle<'a> {
     }
 
     /// Runs the pickle that `bytes` begin with, and says how many of them it takes.
-    pub(super) fn parse_first(bytes: &'a [u8], what: &'static str) -> Result<(Self, usize)> {
+    pub(crate) fn parse_first(bytes: &'a [u8], what: &'static str) -> Result<(Self, usize)> {
         let mut machine = Machine::new(&bytes[..bytes.len().min(MAX_BYTES)], what);
         while machine.step()? {}
         let root = machine.pop()?;
@@ -131,31 +144,44 @@ impl<'a> Pickle<'a> {
         Ok((Self { bytes, values: machine.values, root }, used))
     }
 
-    /// Every storage that the pickle refers to, as often as it does.
-    pub(super) fn storages(&self) -> impl Iterator<Item = &StorageRef> {
+    /// Every object that was built, as often as it was.
+    #[cfg(feature = "import")]
+    pub(crate) fn objects(&self) -> impl Iterator<Item = &V::Object> {
         self.values.iter().filter_map(|value| match value {
-            Value::Storage(storage) => Some(storage),
+            Value::Object(object) => Some(object),
             _ => None,
         })
     }
 
+    /// Where the value is that the pickle is of.
+    #[cfg(feature = "eval")]
+    pub(crate) fn root_id(&self) -> Id {
+        self.root
+    }
+
     /// The value that the pickle is of.
-    pub(super) fn root(&self) -> &Value {
+    pub(crate) fn root(&self) -> &Value<V> {
         self.get(self.root)
     }
 
-    pub(super) fn get(&self, id: Id) -> &Value {
+    pub(crate) fn get(&self, id: Id) -> &Value<V> {
         &self.values[id.0 as usize]
     }
 
     /// The bytes of a string.
-    pub(super) fn text(&self, text: Text) -> &'a [u8] {
+    pub(crate) fn text(&self, text: Text) -> &'a [u8] {
         slice(self.bytes, text)
     }
 
     /// The elements of a tuple or list.
-    pub(super) fn sequence(&self, id: Id) -> Option<&[Id]> {
+    pub(crate) fn sequence(&self, id: Id) -> Option<&[Id]> {
         sequence(&self.values, id)
+    }
+
+    /// What a dict has under `name`: as in Python, the last of equal keys counts.
+    pub(crate) fn under(&self, dict: &[(Id, Id)], name: &str) -> Option<Id> {
+        let is_it = |id| matches!(self.get(id), Value::Str(text) if self.text(*text) == name.as_bytes());
+        dict.iter().rev().find(|(key, _)| is_it(*key)).map(|&(_, value)| value)
     }
 }
 
@@ -163,7 +189,7 @@ fn slice(bytes: &[u8], text: Text) -> &[u8] {
     &bytes[text.start as usize..][..text.len as usize]
 }
 
-fn sequence(values: &[Value], id: Id) -> Option<&[Id]> {
+fn sequence<V: Vocabulary>(values: &[Value<V>], id: Id) -> Option<&[Id]> {
     match &values[id.0 as usize] {
         Value::Tuple(ids) => Some(ids),
         Value::List(ids) => Some(ids),
@@ -177,7 +203,7 @@ const EMPTY: Id = Id(1);
 const FALSE: Id = Id(2);
 const TRUE: Id = Id(3);
 
-struct Machine<'a> {
+pub(crate) struct Machine<'a, V: Vocabulary> {
     bytes: &'a [u8],
     /// What messages call the pickle.
     what: &'static str,
@@ -185,7 +211,7 @@ struct Machine<'a> {
     at: usize,
     /// Position of the instruction that runs.
     op_at: usize,
-    values: Vec<Value>,
+    values: Vec<Value<V>>,
     stack: Vec<Id>,
     /// Heights of the stack where marks lie.
     marks: Vec<usize>,
@@ -194,28 +220,30 @@ struct Machine<'a> {
     copied: usize,
 }
 
-impl<'a> Machine<'a> {
+impl<'a, V: Vocabulary> Machine<'a, V> {
     fn new(bytes: &'a [u8], what: &'static str) -> Self {
+        // Together with its place on the stack this is what one byte of input can cost, up to `MAX_VALUES` times.
+        const { assert!(size_of::<Value<V>>() <= 32) };
         let values = vec![Value::None, Value::Tuple(Box::default()), Value::Bool(false), Value::Bool(true)];
         let (stack, marks, memo) = (Vec::new(), Vec::new(), Vec::new());
         Self { bytes, what, at: 0, op_at: 0, values, stack, marks, memo, copied: 0 }
     }
 
-    fn error(&self, what: impl std::fmt::Display) -> Error {
+    pub(crate) fn error(&self, what: impl std::fmt::Display) -> Error {
         self.error_of(ErrorKind::Format, what)
     }
 
-    fn error_of(&self, kind: ErrorKind, what: impl std::fmt::Display) -> Error {
+    pub(crate) fn error_of(&self, kind: ErrorKind, what: impl std::fmt::Display) -> Error {
         Error::new(kind, format!("{}, byte {}: {what}", self.what, self.op_at))
     }
 
-    fn get(&self, id: Id) -> &Value {
+    pub(crate) fn get(&self, id: Id) -> &Value<V> {
         &self.values[id.0 as usize]
     }
 
     // Input.
 
-    fn text(&mut self, len: u64) -> Result<Text> {
+    fn take(&mut self, len: u64) -> Result<Text> {
         let rest = self.bytes.len() - self.at;
         if len > rest as u64 {
             return Err(self.error(format!("declares {len} bytes, {rest} are left")));
@@ -251,25 +279,31 @@ impl<'a> Machine<'a> {
         let Some(len) = self.bytes[self.at..].iter().position(|&b| b == b'\n') else {
             return Err(self.error("a name without an end"));
         };
-        let text = self.text(len as u64)?;
+        let text = self.take(len as u64)?;
         self.at += 1;
         Ok(text)
     }
 
     // Stack.
 
-    fn push(&mut self, value: Value) -> Result<()> {
+    fn push(&mut self, value: Value<V>) -> Result<()> {
         let id = self.make(value)?;
         self.stack.push(id);
         Ok(())
     }
 
-    fn make(&mut self, value: Value) -> Result<Id> {
+    pub(crate) fn make(&mut self, value: Value<V>) -> Result<Id> {
         if self.values.len() >= MAX_VALUES {
             return Err(self.error_of(ErrorKind::TooLarge, format!("builds more than {MAX_VALUES} values")));
         }
         self.values.push(value);
         Ok(Id(self.values.len() as u32 - 1))
+    }
+
+    /// Puts a value in the place of another.
+    #[cfg(feature = "eval")]
+    pub(crate) fn set(&mut self, id: Id, value: Value<V>) {
+        self.values[id.0 as usize] = value;
     }
 
     /// Whether there is something above the topmost mark.
@@ -377,13 +411,10 @@ impl<'a> Machine<'a> {
             b'K' => Value::Int(self.u8()? as i64),
             b'M' => Value::Int(i64::from(u16::from_le_bytes(self.array()?))),
             b'J' => Value::Int(i64::from(i32::from_le_bytes(self.array()?))),
-            b'G' => {
-                self.array::<8>()?;
-                Value::Inert("a float")
-            }
+            b'G' => Value::Float(f64::from_be_bytes(self.array()?)),
             _ => {
                 let len = if op == 0x8a { self.u8()? } else { self.u32()? };
-                let text = self.text(len)?;
+                let text = self.take(len)?;
                 long(slice(self.bytes, text)).map_or(Value::Inert("a long int"), Value::Int)
             }
         };
@@ -396,9 +427,9 @@ impl<'a> Machine<'a> {
             b'X' | b'T' | b'B' => self.u32()?,
             _ => self.u64()?,
         };
-        let text = self.text(len)?;
+        let text = self.take(len)?;
         self.push(match op {
-            b'C' | b'B' | 0x8e | 0x96 => Value::Inert("bytes"),
+            b'C' | b'B' | 0x8e | 0x96 => Value::Bytes(text),
             _ => Value::Str(text),
         })
     }
@@ -454,30 +485,94 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    /// `('storage', class, key, location, numel)`, and in files without a zip None behind it, or what the storage is a part
-    /// of.
     fn persistent(&mut self) -> Result<()> {
         let id = self.pop()?;
-        let wrong = "a persistent id, expected ('storage', class, key, location, length)";
-        let Value::Tuple(parts) = self.get(id) else { return Err(self.error(wrong)) };
-        let &[tag, class, key, location, numel, ref view @ ..] = &**parts else { return Err(self.error(wrong)) };
-        match view {
-            [] => {}
-            &[view] if matches!(self.get(view), Value::None) => {}
-            _ => return Err(self.error_of(ErrorKind::Unsupported, "a storage that is a part of another")),
-        }
-        let (Value::Str(tag), Value::Global { module, name }, Value::Str(key), Value::Str(_), &Value::Int(numel)) =
-            (self.get(tag), self.get(class), self.get(key), self.get(location), self.get(numel))
-        else {
-            return Err(self.error(wrong));
+        let object = V::persistent(self, id)?;
+        self.push(Value::Object(object))
+    }
+
+    // Calls.
+
+    /// The bytes of a string.
+    pub(crate) fn text(&self, text: Text) -> &'a [u8] {
+        slice(self.bytes, text)
+    }
+
+    /// Module and name, where they are text.
+    pub(crate) fn name_of(&self, module: Text, name: Text) -> Option<(&'a str, &'a str)> {
+        let text = |t| std::str::from_utf8(slice(self.bytes, t)).ok();
+        Some((text(module)?, text(name)?))
+    }
+
+    /// `"module.name"`, shortened where it is longer than any real one.
+    pub(crate) fn quote(&self, module: Text, name: Text) -> String {
+        let short = |t: Text| {
+            let bytes = slice(self.bytes, t);
+            String::from_utf8_lossy(&bytes[..bytes.len().min(100)]).into_owned()
         };
-        if slice(self.bytes, *tag) != b"storage" || numel < 0 {
-            return Err(self.error(wrong));
+        format!("{:?}", format!("{}.{}", short(module), short(name)))
+    }
+
+    /// That `name` may not be called.
+    pub(crate) fn refusal(&self, name: &str) -> Error {
+        self.error(format!("calls {name}; {}", V::ALLOWED))
+    }
+
+    /// That `name` may be called, but not so.
+    pub(crate) fn wrong_arguments(&self, name: &str) -> Error {
+        self.error(format!("calls {name} with arguments that it does not take"))
+    }
+
+    /// The elements of a tuple or list.
+    pub(crate) fn sequence(&self, id: Id) -> Option<&[Id]> {
+        sequence(&self.values, id)
+    }
+
+    /// Pushes what stands for `callee(*args)`, or refuses it by name.
+    fn push_call(&mut self, callee: Id, args: Id) -> Result<()> {
+        let (callable, name) = self.callable(callee)?;
+        let args = match self.get(args) {
+            // The arguments of inert objects may be many and are not copied.
+            Value::Tuple(args) => args[..args.len().min(MAX_ARGUMENTS)].to_vec(),
+            other => return Err(self.error(format!("calls {name} with {}, expected a tuple", other.kind()))),
+        };
+        let id = V::call(self, callable, &name, &args)?;
+        self.stack.push(id);
+        Ok(())
+    }
+
+    /// What calling `callee` stands for, and its quoted name.
+    pub(crate) fn callable(&self, callee: Id) -> Result<(V::Callable, String)> {
+        let &Value::Global { module, name } = self.get(callee) else {
+            return Err(self.refusal(self.get(callee).kind()));
+        };
+        let quoted = self.quote(module, name);
+        match self.name_of(module, name).and_then(|(m, n)| V::callable(m, n)) {
+            Some(callable) => Ok((callable, quoted)),
+            None => Err(self.refusal(&quoted)),
         }
-        let element = self.name_of(*module, *name).and_then(|(m, n)| globals::storage(m, n)).ok_or_else(|| {
-            self.error_of(ErrorKind::Unsupported, format!("a storage of class {}", self.quote(*module, *name)))
-        })?;
-        self.push(Value::Storage(StorageRef { element, key: *key, numel: numel as u64 }))
+    }
+
+    /// `OrderedDict()` or `OrderedDict([(key, value), ...])`; `None` for other arguments.
+    pub(crate) fn ordered_dict(&mut self, args: &[Id]) -> Result<Option<Value<V>>> {
+        let pairs = match args {
+            [] => return Ok(Some(Value::Dict(Vec::new()))),
+            &[pairs] => pairs,
+            _ => return Ok(None),
+        };
+        let Some(pairs) = sequence(&self.values, pairs) else { return Ok(None) };
+        // One list can be copied again and again by few instructions; no pickler does so.
+        let copied = self.copied + pairs.len();
+        if copied > self.bytes.len() {
+            return Err(self.error_of(ErrorKind::TooLarge, "copies more pairs than it has bytes"));
+        }
+        let mut dict = Vec::with_capacity(pairs.len());
+        for &pair in pairs {
+            let Some(&[key, value]) = sequence(&self.values, pair) else { return Ok(None) };
+            dict.push((key, value));
+        }
+        self.copied = copied;
+        Ok(Some(Value::Dict(dict)))
     }
 
     fn object(&mut self, op: u8) -> Result<()> {
@@ -517,10 +612,12 @@ impl<'a> Machine<'a> {
                 self.push_call(class, args)
             }
             b'b' => {
-                self.pop()?;
-                match self.get(self.top()?) {
-                    // An attribute of a dict or tensor (such as a state dict's versions), or the state of what is inert.
-                    Value::Dict(_) | Value::Tensor(_) | Value::Inert(_) => Ok(()),
+                let state = self.pop()?;
+                let target = self.top()?;
+                match self.get(target) {
+                    // An attribute of a dict (such as a state dict's versions), or the state of what is inert.
+                    Value::Dict(_) | Value::Inert(_) => Ok(()),
+                    Value::Object(_) => V::set_state(self, target, state),
                     other => Err(self.error(format!("sets the state of {}", other.kind()))),
                 }
             }
