@@ -77,16 +77,17 @@ impl Case for Call {
     }
 
     fn exact(&self) -> Option<Exact> {
-        let kept = |col: &&u32| self.masked.as_ref().is_none_or(|m| !m[**col as usize / self.per_camera]);
+        let e = &self.entries;
+        let kept = |col: &&u32| e.masked.as_ref().is_none_or(|m| !m[**col as usize / e.per_camera]);
         let mut values = Vec::new();
-        for row in self.rows.clone() {
-            let cols = &self.col[self.ptr[row] as usize..self.ptr[row + 1] as usize];
+        for row in e.rows.clone() {
+            let cols = &e.col[e.ptr[row] as usize..e.ptr[row + 1] as usize];
             let pixels: Vec<usize> = cols.iter().filter(kept).map(|&col| col as usize).collect();
-            for c in 0..self.channels {
-                let feature = |pixel: &usize| f64::from(self.features[pixel * self.stride + self.first_channel + c]);
+            for c in 0..e.channels {
+                let feature = |pixel: &usize| f64::from(self.features[pixel * e.stride + e.first_channel + c]);
                 let mean = pixels.iter().map(feature).sum::<f64>() / pixels.len().max(1) as f64;
                 let value = mean + self.bias.as_ref().map_or(0.0, |bias| f64::from(bias[c]));
-                values.push(if self.relu { value.max(0.0) } else { value });
+                values.push(if e.relu { value.max(0.0) } else { value });
             }
         }
         Some(Exact { values, tolerance: 1e-6 })
