@@ -135,18 +135,20 @@ impl Import {
         is_model.then(|| Model::open(&self.checkpoint)).transpose()
     }
 
-    fn rewrites(&self) -> Rewrites {
+    /// The rewrites that are asked for. Integers are summed directly, and ranges measured so.
+    fn rewrites(&self, precision: Precision) -> Rewrites {
         let rewrites = match self.fold.as_str() {
             "all" => Rewrites::ALL,
             "none" => Rewrites::NONE,
             _ => Rewrites { projection: false, ..Rewrites::ALL },
         };
-        Rewrites { winograd: rewrites.winograd && !self.exact, ..rewrites }
+        let winograd = rewrites.winograd && !self.exact && precision != Precision::I8;
+        Rewrites { winograd, ..rewrites }
     }
 
     fn convert(&self, source: &dyn Source, network: &Network, precision: Precision, notes: Vec<Note>) -> Result<()> {
         let in_checkpoint = |e: Error| e.in_file(&self.checkpoint);
-        let rewrites = self.rewrites();
+        let rewrites = self.rewrites(precision);
         let bar = terminal::progress("importing", 0);
         let progress = &mut steps(&bar);
         let ranges = match precision {
@@ -198,7 +200,7 @@ impl Import {
     /// The operations to keep in f32 so that the logits are as close to those of f32 as `target` asks.
     fn mix(&self, source: &dyn Source, network: &Network, ranges: &Ranges, target: f64) -> Result<Vec<String>> {
         let scenes = calibrate::some(&self.calibrate, MIXED_FRAMES, network)?;
-        let integers = Integers { rewrites: self.rewrites(), ranges, keep_f32: &self.keep_f32 };
+        let integers = Integers { rewrites: self.rewrites(Precision::I8), ranges, keep_f32: &self.keep_f32 };
         let threads = self.threads.threads()?;
         let mixed = Mixed::new(source, network, integers, &scenes, (Isa::best(), &threads))?;
         let bar = terminal::progress("mixing", mixed.runs());

@@ -54,7 +54,7 @@ impl Graph {
     ///
     /// # Errors
     /// [`ErrorKind::Unsupported`] for a name in `keep_f32` that no operation has, and for a graph with batch norms of
-    /// their own; those of `scale`.
+    /// their own or convolutions by minimal filtering; those of `scale`.
     pub fn quantise(mut self, keep_f32: &[String], scale: &mut dyn FnMut(&str) -> Result<Scale>) -> Result<Self> {
         let kept = self.kept(keep_f32)?;
         let scaled = self.scaled_as();
@@ -99,8 +99,11 @@ impl Graph {
             );
             return Err(Error::new(ErrorKind::Unsupported, message));
         }
-        if let Some(norm) = self.operations.iter().find(|o| matches!(o.op, Op::BatchNorm(_))) {
-            let message = format!("operation \"{}\": only networks with folded batch norms run in integers", norm.name);
+        if let Some(other) = self.operations.iter().find(|o| matches!(o.op, Op::BatchNorm(_) | Op::Winograd(_))) {
+            let message = format!(
+                "operation \"{}\": only networks with folded batch norms and direct convolutions run in integers",
+                other.name
+            );
             return Err(Error::new(ErrorKind::Unsupported, message));
         }
         let product = |op: &Op| matches!(op, Op::Conv(_) | Op::DeformConv(_) | Op::Deconv(_) | Op::Head(_));

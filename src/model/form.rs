@@ -166,7 +166,8 @@ pub(crate) fn quantisation(
     scale: &dyn Fn(&str) -> Result<Scale>,
 ) -> Result<Quantisation> {
     let scales = RefCell::new(BTreeMap::new());
-    let graph = Graph::build(network, Results::ALL).rewritten(rewrites);
+    // Integers are summed directly.
+    let graph = Graph::build(network, Results::ALL).rewritten(Rewrites { winograd: false, ..rewrites });
     graph.quantise(keep_f32, &mut |name| {
         let scale = scale(name)?;
         scales.borrow_mut().insert(name.to_owned(), scale);

@@ -184,7 +184,7 @@ fn no_operation_has_more_parts_than_a_session_has_room_for() {
                 assert_eq!(stores, operation.recipe != Recipe::None, "{}", operation.name);
             }
         }
-        let graph = Graph::build(&network, Results::ALL).rewritten(Rewrites::ALL);
+        let graph = Graph::build(&network, Results::ALL).rewritten(Rewrites { winograd: false, ..Rewrites::ALL });
         let graph = graph.quantise(&[], &mut |_| Scale::of_range(1.0)).expect("scales for all");
         assert_eq!(most(&graph), MAX_PARTS);
     }
@@ -303,6 +303,7 @@ fn a_model_gives_its_weights_back() {
     let network = network();
     for (precision, rewrites) in
         [(Precision::F32, Rewrites::ALL), (Precision::F16, Rewrites { projection: false, ..Rewrites::ALL })]
+            .map(|(precision, rewrites)| (precision, Rewrites { winograd: false, ..rewrites }))
     {
         let model = small::model(&network, precision, rewrites, 1);
         let source = unpacked::Unpacked::new(&model).expect("floating point");

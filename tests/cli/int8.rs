@@ -19,7 +19,7 @@ fn a_checkpoint_becomes_int8_runs_and_is_compared() {
     let [network, weights, scene] = ["network.json", "weights.pth", "scene"].map(|f| place.text(f));
     let [int8, f32, ranges, again, out] = ["int8", "f32", "ranges.json", "again", "out.npz"].map(|f| place.text(f));
     assert!(import_int8(&place, "int8", &[]).contains("int8 weights"));
-    done(&["import", &weights, "--network", &network, "-o", &f32]);
+    done(&["import", &weights, "--network", &network, "--exact", "-o", &f32]);
     // Ranges apart, of the model: the same model.
     assert!(done(&["calibrate", &f32, &scene, "-o", &ranges]).contains("measured on 1 frames"));
     let base = ["import", &weights, "--network", &network, "--precision", "i8", "--ranges", &ranges];
@@ -63,7 +63,7 @@ fn operations_are_kept_by_name_and_by_measurement() {
     assert!(decibels >= 59.9, "{told}");
     // What was told is what a comparison finds.
     let [network, weights, scene, mixed] = ["network.json", "weights.pth", "scene", "mixed"].map(|f| place.text(f));
-    done(&["import", &weights, "--network", &network, "-o", &f32, "--no-self-test"]);
+    done(&["import", &weights, "--network", &network, "--exact", "-o", &f32, "--no-self-test"]);
     let compare = ["compare", "--model", &mixed, "--against", &f32, &scene, "--tolerance", "inf", "--json"];
     let stages: Value = serde_json::from_str(&done(&compare)).unwrap();
     let stages = stages["stages"].as_array().unwrap();

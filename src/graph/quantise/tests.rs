@@ -4,7 +4,7 @@ use crate::network::Network;
 
 fn folded(name: &str) -> Graph {
     let network = Network::built_in(name).expect("built in");
-    Graph::build(&network, Results::ALL).rewritten(Rewrites::ALL)
+    Graph::build(&network, Results::ALL).rewritten(Rewrites { winograd: false, ..Rewrites::ALL })
 }
 
 fn quantised(graph: Graph, keep_f32: &[&str]) -> Graph {
