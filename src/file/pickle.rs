@@ -174,6 +174,7 @@ impl<'a, V: Vocabulary> Pickle<'a, V> {
     }
 
     /// The elements of a tuple or list.
+    #[cfg(feature = "import")]
     pub(crate) fn sequence(&self, id: Id) -> Option<&[Id]> {
         sequence(&self.values, id)
     }
