@@ -40,12 +40,12 @@ fn assert_same(found: &Bits, expected: &Bits, what: &str) {
     assert_eq!((found.logits.len(), found.classes.len()), (expected.logits.len(), expected.classes.len()), "{what}");
 }
 
-/// Results that could not reveal a difference would prove nothing.
-fn assert_varied(bits: &Bits) {
+/// Results that could not reveal a difference would prove nothing: one logit in `alike` is like no other.
+fn assert_varied(bits: &Bits, alike: usize) {
     let mut values = bits.logits.clone();
     values.sort_unstable();
     values.dedup();
-    assert!(values.len() > bits.logits.len() / 2, "{} different logits", values.len());
+    assert!(values.len() > bits.logits.len() / alike, "{} different logits", values.len());
     assert!(bits.logits.iter().all(|&b| f32::from_bits(b).is_finite()));
     let mut classes = bits.classes.clone();
     classes.sort_unstable();
@@ -83,7 +83,8 @@ fn isa_threads_repetition_company_and_rig_swaps_do_not_show() {
         let model = small::model(&network, precision, rewrites, 1);
         let images = images.views();
         let expected = run(&mut session(&model, &rig, Isa::Scalar, Threads::calling()), &images);
-        assert_varied(&expected);
+        // Integers are often the same.
+        assert_varied(&expected, if precision == Precision::I8 { 8 } else { 2 });
         for isa in Isa::available() {
             for count in [1, 2, 3, 8] {
                 let what = format!("{} {rewrites:?} {} on {count} threads", precision.name(), isa.name());

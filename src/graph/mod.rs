@@ -40,6 +40,7 @@ pub use ops::Op;
 pub use options::{Results, Rewrites};
 pub use quantise::Quantisation;
 pub use recipe::{ConvNames, Recipe};
+pub(crate) use scale::LEVELS;
 pub use scale::Scale;
 pub use site::{Residual, Site};
 pub use tensor::{Branch, Lifetime, Scope, Section, Space, Tensor, TensorId};

@@ -6,7 +6,7 @@ use crate::base::error::{Error, ErrorKind, Result};
 use crate::file::container::{self, Data, Tensor};
 use crate::graph::parts::{Part, Precision};
 use crate::graph::weights::{Values, Weights};
-use crate::graph::{Element, Graph, Operation, Rewrites};
+use crate::graph::{Element, Graph, LEVELS, Operation, Results, Rewrites, Scale};
 #[cfg(feature = "import")]
 use crate::model::checkpoint::Checkpoint;
 use crate::model::ranges::Ranges;
@@ -14,6 +14,7 @@ use crate::model::{self, Form, Options, parts};
 use crate::network::Network;
 use half::f16;
 use std::cell::RefCell;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 #[cfg(feature = "import")]
@@ -106,11 +107,40 @@ pub struct Integers<'a> {
 }
 
 impl Integers<'_> {
-    fn form(&self, network: &Network) -> Result<Form> {
-        let scale = |name: &str| self.ranges.scale(name);
-        let quantisation = model::quantisation(network, self.rewrites, self.keep_f32, &scale)?;
-        Form::integers(network, self.rewrites, quantisation)
+    /// The form of the model. A scale that is finer than the sums of the weights that write its tensor is made as coarse as they
+    /// are, and with it whatever depends on it.
+    fn form(&self, source: &dyn Source, network: &Network) -> Result<Form> {
+        let mut least: BTreeMap<String, f64> = BTreeMap::new();
+        loop {
+            let scale = |name: &str| {
+                let scale = self.ranges.scale(name)?;
+                let least = least.get(name).copied().unwrap_or_default();
+                // A little more, for it is rounded to f32.
+                if scale.wide() < least { Scale::of_range(least * LEVELS * (1.0 + 1e-6)) } else { Ok(scale) }
+            };
+            let quantisation = model::quantisation(network, self.rewrites, self.keep_f32, &scale)?;
+            let form = Form::integers(network, self.rewrites, quantisation)?;
+            let Some((name, finest)) = too_fine(&form.graph(false, Results::ALL)?, source)? else { return Ok(form) };
+            if least.insert(name, finest).is_some_and(|before| finest <= before) {
+                // Another tensor's scale decides; the operation itself says what is wrong.
+                return Ok(form);
+            }
+        }
     }
+}
+
+/// The first tensor whose scale is finer than what writes it can write, and what that is.
+fn too_fine(graph: &Graph, source: &dyn Source) -> Result<Option<(String, f64)>> {
+    for operation in &graph.operations {
+        let tensor = graph.tensor(operation.output());
+        let finest = operation.op.description().finest(&graph.site(operation), &Weights(source))?;
+        if let Some((scale, finest)) = tensor.scale.zip(finest)
+            && scale.wide() < finest
+        {
+            return Ok(Some((tensor.name.clone(), finest)));
+        }
+    }
+    Ok(None)
 }
 
 /// [`import`] to a model of 8-bit integers.
@@ -125,7 +155,7 @@ pub fn import_int8(
     path: &Path,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<()> {
-    Conversion::new(source, integers.form(network)?)?.write(path, progress)
+    Conversion::new(source, integers.form(source, network)?)?.write(path, progress)
 }
 
 /// [`import_to_bytes`] to a model of 8-bit integers.
@@ -138,7 +168,7 @@ pub fn import_int8_to_bytes(
     integers: &Integers<'_>,
     progress: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<u8>> {
-    Conversion::new(source, integers.form(network)?)?.bytes(progress)
+    Conversion::new(source, integers.form(source, network)?)?.bytes(progress)
 }
 
 /// Everything that goes into a model, in file order.

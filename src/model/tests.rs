@@ -259,8 +259,8 @@ fn what_kernels_take_for_granted_of_int8_is_checked() {
     metadata("scales", "{\"image\":0}", "metadata key \"scales\"");
     metadata("scales", "[]", "metadata key \"scales\"");
     metadata("keep_f32", "[\"nothing\"]", "no operation \"nothing\"");
-    metadata("keep_f32", "[\"img_backbone.layer1.0.conv1\"]", "is missing");
-    metadata("precision", "f32", "is missing");
+    metadata("keep_f32", "[\"img_backbone.layer1.0.conv1\"]", "expected F32");
+    metadata("precision", "f32", "expected F32");
 }
 
 #[test]
@@ -274,7 +274,7 @@ fn int8_is_refused_where_it_cannot_be() {
         let mut ranges = small::ranges(&network, Rewrites::ALL, 1);
         change(&mut ranges);
         let integers = import::Integers { rewrites: Rewrites::ALL, ranges: &ranges, keep_f32: &[] };
-        let error = import::import_int8_to_bytes(&small::Weights(1), &network, &integers, &mut |_, _| ());
+        let error = import::import_int8_to_bytes(&small::Near(small::Weights(1)), &network, &integers, &mut |_, _| ());
         let error = error.expect_err(expected);
         assert!(error.message().contains(expected) && !error.message().contains('\n'), "{error} (expected {expected})");
     };
@@ -288,7 +288,6 @@ fn int8_is_refused_where_it_cannot_be() {
     refused(&set(0.0), "its range is 0");
     refused(&set(f64::NAN), "range NaN");
     refused(&set(1e-43), "the scale underflows");
-    refused(&set(1e-12), "operation \"img_backbone.layer1.0.conv1\": the output's step of");
     let integers = import::Integers {
         rewrites: Rewrites::NONE,
         ranges: &small::ranges(&network, Rewrites::ALL, 1),
@@ -296,6 +295,26 @@ fn int8_is_refused_where_it_cannot_be() {
     };
     let error = import::import_int8_to_bytes(&source, &network, &integers, &mut |_, _| ()).expect_err("batch norms");
     assert!(error.message().contains("folded batch norms"), "{error}");
+}
+
+#[test]
+fn a_range_that_is_finer_than_its_sums_is_made_coarser() {
+    let (network, _) = int8();
+    let conv = "img_backbone.layer1.0.conv1";
+    let scale = |threshold: Option<f64>| {
+        let mut ranges = small::ranges(&network, Rewrites::ALL, 1);
+        if let Some(threshold) = threshold {
+            ranges.tensors.get_mut(conv).expect("it").threshold = threshold;
+        }
+        let integers = import::Integers { rewrites: Rewrites::ALL, ranges: &ranges, keep_f32: &[] };
+        let source = small::Near(small::Weights(1));
+        let bytes = import::import_int8_to_bytes(&source, &network, &integers, &mut |_, _| ()).expect("a model");
+        let model = Model::from_bytes(bytes).expect("what was just written");
+        model.quantisation().expect("int8").scales[conv].wide()
+    };
+    let [fine, finer] = [1e-9, 1e-12].map(|threshold| scale(Some(threshold)));
+    assert_eq!(fine, finer, "what the weights give");
+    assert!(fine > 1e-9 && fine < scale(None), "{fine:e}");
 }
 
 #[test]

@@ -93,7 +93,8 @@ struct Recorder(RefCell<Tensors>);
 
 impl Source for Recorder {
     fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>> {
-        let values: Vec<f32> = small::Weights(3).tensor(name, shape)?.into_iter().map(|v| v as f32).collect();
+        let values: Vec<f32> =
+            small::Near(small::Weights(3)).tensor(name, shape)?.into_iter().map(|v| v as f32).collect();
         self.0.borrow_mut().insert(name.to_owned(), (shape.to_vec(), values.clone()));
         Ok(values.into_iter().map(f64::from).collect())
     }

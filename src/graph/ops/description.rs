@@ -62,6 +62,15 @@ pub trait Description: Debug + Sync {
         Ok(())
     }
 
+    /// The finest step of an 8-bit output to which sums of these weights can be brought, if there is one.
+    ///
+    /// # Errors
+    /// Those of the source of the weights.
+    fn finest(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Option<f64>> {
+        let _ = (site, weights);
+        Ok(None)
+    }
+
     /// Bytes of scratch that a worker needs.
     fn scratch(&self, site: &Site<'_>) -> usize {
         let _ = site;

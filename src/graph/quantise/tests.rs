@@ -72,7 +72,9 @@ fn what_is_kept_takes_along_what_belongs_to_it() {
             .collect::<Vec<_>>()
     };
     assert_eq!(keep(&[]), [""; 0]);
-    assert_eq!(keep(&["img_backbone.conv1"]), ["image", "img_backbone.conv1", "img_backbone.conv1.i8"]);
+    // The image goes with the stem, and what pools the result follows.
+    let expected = ["image", "img_backbone.conv1", "img_backbone.maxpool", "img_backbone.maxpool.i8"];
+    assert_eq!(keep(&["img_backbone.conv1"]), expected);
     // The offsets of a deformable convolution, and the other way around.
     let conv = "img_backbone.layer3.4.conv2";
     let expected = ["img_backbone.layer3.4.conv1.f32", &format!("{conv}.conv_offset"), conv, &format!("{conv}.i8")];
@@ -83,12 +85,14 @@ fn what_is_kept_takes_along_what_belongs_to_it() {
     let branches = aspp.iter().filter(|name| name.contains("aspp.convs.") && name.ends_with(".0")).count();
     assert_eq!(branches, 5, "{aspp:?}");
     // Features are kept per camera as they are gathered.
-    let graph = quantised(folded("nuscenes-200"), &["img_neck.fpn_convs.0.conv.projected"]);
+    let gathers = ["volume", "bev"].map(|branch| format!("view_transformer.imvts.0.gather.{branch}"));
+    let graph = quantised(folded("nuscenes-200"), &gathers.each_ref().map(|name| &name[..]));
     let features = graph.operations.iter().find(|o| o.name == "img_neck.fpn_convs.0.conv.projected").expect("it");
-    assert_eq!(graph.tensor(features.output()).lifetime, Lifetime::Pass);
-    let bytes =
-        graph.tensors.iter().find(|t| t.name.ends_with("projected.i8") || t.name == "img_neck.fpn_convs.0.conv.i8");
-    assert_eq!(bytes.expect("converted").lifetime, Lifetime::Camera);
+    let features = graph.tensor(features.output());
+    assert_eq!((features.element, features.lifetime), (Element::I8, Lifetime::Pass));
+    let name = format!("{}.f32", features.name);
+    let converted = graph.tensors.iter().find(|t| t.name == name).expect("converted");
+    assert_eq!((converted.element, converted.lifetime), (Element::F32, Lifetime::Camera));
     // A gather of features of which none is left in integers.
     let all = keep(&["img_backbone", "img_neck"]);
     assert!(all.iter().any(|name| name.ends_with("imvts.0.gather.volume")), "{all:?}");

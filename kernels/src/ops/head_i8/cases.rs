@@ -28,12 +28,14 @@ pub(crate) fn draw(draw: &mut Draw) -> Option<impl Case + use<>> {
         return None;
     }
     let (columns, signed) = ([channels, channels, classes], draw.flag());
+    // Beside biases of any size products would not tell.
+    let shift = if draw.flag() { 20 } else { 0 };
     Some(Call {
         channels,
         classes,
         rows: draw.rows(voxels),
         weights: columns.map(|columns| WeightsI8::draw(draw, channels, columns, 1)),
-        biases: columns.map(|columns| padded(draw, columns, i32::MIN)),
+        biases: columns.map(|columns| padded(draw, columns, i32::MIN).into_iter().map(|bias| bias >> shift).collect()),
         multipliers: [channels; 2].map(|columns| padded(draw, columns, 0)),
         input: left(draw, voxels * channels, signed),
         signed,

@@ -1,7 +1,9 @@
 //! The integers of a product's columns: from weights and scales in f64.
 
+use super::step;
 use crate::base::error::{Error, ErrorKind, Result};
-use crate::graph::scale::LEVELS;
+use crate::graph::scale::{LEVELS, Scale};
+use crate::graph::site::Site;
 use voxcast_kernels::quantised::MULTIPLIER_BITS;
 
 /// The smallest multiplier: below, its own rounding would show in an output.
@@ -36,6 +38,12 @@ pub(super) struct Column {
 }
 
 impl Steps {
+    /// Those of an operation whose tensors all have scales.
+    pub(super) fn of(site: &Site<'_>) -> Self {
+        let output = site.output().scale.map_or(1.0, Scale::wide);
+        Self { input: step(site.input(0)), output, residual: site.added().map(step) }
+    }
+
     /// The column of these weights, and of a bias in real units.
     ///
     /// Its scale is the finest that represents the largest weight, made coarser where the bias, the residual's multiplier or
@@ -45,19 +53,10 @@ impl Steps {
     /// # Errors
     /// [`ErrorKind::Unsupported`] if the output's step, or the residual's, is too fine for the weights.
     pub(super) fn column(&self, weights: &[f64], bias: f64) -> Result<Column> {
-        let most = weights.iter().fold(0.0f64, |most, w| most.max(w.abs()));
         let power = super::power(MULTIPLIER_BITS);
-        let mut scale = (most / LEVELS)
-            .max(bias.abs() / (self.input * MOST_BIAS))
-            .max(LEAST_MULTIPLIER / power * self.output / self.input);
-        let mut residual = 0.0;
-        if let Some(step) = self.residual {
-            scale = scale.max(step / (self.input * MOST_RESIDUAL));
-            residual = (step / (self.input * scale)).floor();
-            if residual < 1.0 {
-                return Err(self.refused("residual", step));
-            }
-            scale = step / (self.input * residual);
+        let (scale, residual) = self.scale(weights, bias, LEAST_MULTIPLIER / power * self.output / self.input);
+        if self.residual.is_some() && residual < 1.0 {
+            return Err(self.refused("residual", self.residual.unwrap_or_default()));
         }
         let unit = self.input * scale;
         let multiplier = (power * (unit / self.output)).round();
@@ -66,6 +65,23 @@ impl Steps {
         }
         let weights = weights.iter().map(|w| (w / scale).round().clamp(-LEVELS, LEVELS)).collect();
         Ok(Column { weights, bias: (bias / unit).round(), residual, multiplier })
+    }
+
+    /// The finest step of an output to which sums of the column of these weights can be brought: two of their units.
+    pub(super) fn finest(&self, weights: &[f64], bias: f64) -> f64 {
+        let (scale, _) = self.scale(weights, bias, 0.0);
+        // What is lost where a step is rounded to f32, and the multiplier to an integer.
+        2.0 * self.input * scale * (1.0 + 1e-6)
+    }
+
+    /// The weights' scale, at least `least`, and the residual's multiplier.
+    fn scale(&self, weights: &[f64], bias: f64, least: f64) -> (f64, f64) {
+        let most = weights.iter().fold(0.0f64, |most, w| most.max(w.abs()));
+        let scale = (most / LEVELS).max(bias.abs() / (self.input * MOST_BIAS)).max(least);
+        let Some(step) = self.residual else { return (scale, 0.0) };
+        let scale = scale.max(step / (self.input * MOST_RESIDUAL));
+        let residual = (step / (self.input * scale)).floor();
+        if residual < 1.0 { (scale, 0.0) } else { (step / (self.input * residual), residual) }
     }
 
     fn refused(&self, what: &str, step: f64) -> Error {

@@ -1,7 +1,7 @@
 //! Convolution of 8-bit tensors, and the offsets of a deformable one.
 
 use super::columns::Steps;
-use super::{product, step};
+use super::product;
 use crate::base::error::Result;
 use crate::graph::call::{Call, Tile};
 use crate::graph::element::{Element, Elements};
@@ -30,6 +30,11 @@ pub struct ConvI8 {
 }
 
 impl ConvI8 {
+    /// Whether it computes the offsets of a deformable convolution.
+    fn has_offsets(&self, site: &Site<'_>) -> bool {
+        site.output().element == Element::I32
+    }
+
     /// What output `n` counts in, of a tensor without scale.
     fn offset_step(&self, site: &Site<'_>, n: usize) -> f64 {
         let taps = self.geometry.kernel.iter().product();
@@ -57,16 +62,22 @@ impl Description for ConvI8 {
 
     fn evaluate(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
         let dense = floating::dense(&self.geometry, self.inputs, site, weights)?;
-        let offsets = site.output().element == Element::I32;
-        let steps = |n| Steps {
-            input: step(site.input(0)),
-            output: if offsets { self.offset_step(site, n) } else { step(site.output()) },
-            residual: site.added().map(step),
+        let steps = |n| match self.has_offsets(site) {
+            true => Steps { output: self.offset_step(site, n), ..Steps::of(site) },
+            false => Steps::of(site),
         };
         let channels = [self.inputs, self.geometry.channels];
         let columns =
             product::columns(&dense.weight, &dense.bias, channels, |n, weight, bias| steps(n).column(weight, bias))?;
         Ok(product::values(1, &columns, site.residual.is_some()))
+    }
+
+    fn finest(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Option<f64>> {
+        if self.has_offsets(site) {
+            return Ok(None);
+        }
+        let dense = floating::dense(&self.geometry, self.inputs, site, weights)?;
+        Ok(Some(product::finest(Steps::of(site), &dense.weight, &dense.bias)))
     }
 
     fn verify(&self, site: &Site<'_>, parts: &[Elements<'_>]) -> std::result::Result<(), String> {

@@ -2,7 +2,6 @@
 
 use super::columns::{Column, Steps};
 use super::product::{self, BIAS, MULTIPLIER, PAIRS, RESIDUAL, SUMS, WEIGHTS};
-use super::step;
 use crate::base::error::Result;
 use crate::graph::call::{Added, Call, Tile};
 use crate::graph::element::Elements;
@@ -25,6 +24,12 @@ fn depth(site: &Site<'_>) -> usize {
     TAPS * site.input(0).channels
 }
 
+/// The weights of output channel `n`. All eight parities have one scale, so that they can have one bias.
+fn column(site: &Site<'_>, weight: &impl Fn(usize, usize, usize) -> f64, n: usize) -> Values {
+    let column = (0..TAPS).flat_map(|parity| (0..depth(site)).map(move |k| (parity, k)));
+    column.map(|(parity, k)| weight(parity, k, n)).collect()
+}
+
 impl Description for DeconvI8 {
     fn kind(&self) -> &'static str {
         "deconv3d i8"
@@ -36,15 +41,17 @@ impl Description for DeconvI8 {
 
     fn evaluate(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
         let (weight, bias) = folded(site, weights)?;
-        let steps = Steps { input: step(site.input(0)), output: step(site.output()), residual: site.added().map(step) };
-        let columns = (0..site.channels).map(|n| {
-            // All eight parities have one scale, so that they can have one bias.
-            let column = (0..TAPS).flat_map(|parity| (0..depth(site)).map(move |k| (parity, k)));
-            let column: Values = column.map(|(parity, k)| weight(parity, k, n)).collect();
-            steps.column(&column, bias[n])
-        });
+        let steps = Steps::of(site);
+        let columns = (0..site.channels).map(|n| steps.column(&column(site, &weight, n), bias[n]));
         let columns: Vec<Column> = columns.collect::<Result<_>>()?;
         Ok(product::values(TAPS, &columns, site.residual.is_some()))
+    }
+
+    fn finest(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Option<f64>> {
+        let (weight, bias) = folded(site, weights)?;
+        let steps = Steps::of(site);
+        let finest = (0..site.channels).map(|n| steps.finest(&column(site, &weight, n), bias[n]));
+        Ok(Some(finest.fold(0.0, f64::max)))
     }
 
     fn verify(&self, site: &Site<'_>, parts: &[Elements<'_>]) -> std::result::Result<(), String> {

@@ -1,7 +1,7 @@
 //! Modulated deformable convolution of an 8-bit image.
 
 use super::columns::Steps;
-use super::{product, step};
+use super::product;
 use crate::base::error::Result;
 use crate::graph::call::{Call, Tile};
 use crate::graph::element::Elements;
@@ -38,10 +38,15 @@ impl Description for DeformConvI8 {
     fn evaluate(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
         let channels = self.geometry.channels;
         let dense = floating::dense(&self.geometry, channels, site, weights)?;
-        let steps = Steps { input: step(site.input(0)), output: step(site.output()), residual: site.added().map(step) };
+        let steps = Steps::of(site);
         let column = |_, weight: &[f64], bias| steps.column(weight, bias);
         let columns = product::columns(&dense.weight, &dense.bias, [channels; 2], column)?;
         Ok(product::values(1, &columns, site.residual.is_some()))
+    }
+
+    fn finest(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Option<f64>> {
+        let dense = floating::dense(&self.geometry, self.geometry.channels, site, weights)?;
+        Ok(Some(product::finest(Steps::of(site), &dense.weight, &dense.bias)))
     }
 
     fn verify(&self, site: &Site<'_>, parts: &[Elements<'_>]) -> std::result::Result<(), String> {

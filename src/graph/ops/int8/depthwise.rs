@@ -1,7 +1,7 @@
 //! Depthwise convolution of an 8-bit plane.
 
 use super::columns::{Column, Steps};
-use super::{integers, step, within};
+use super::{integers, product, within};
 use crate::base::error::Result;
 use crate::graph::call::{Call, Tile};
 use crate::graph::element::{Element, Elements};
@@ -9,7 +9,7 @@ use crate::graph::ops::description::{Description, Machine, whole_lines, wide};
 use crate::graph::parts::Part;
 use crate::graph::recipe::Recipe;
 use crate::graph::site::Site;
-use crate::graph::weights::{Values, Weights, packed_taps, padded};
+use crate::graph::weights::{Dense, Values, Weights, packed_taps, padded};
 use voxcast_kernels::LANES;
 use voxcast_kernels::depthwise::Depthwise;
 use voxcast_kernels::depthwise_i8::{DepthwiseI8 as Kernel, depthwise_i8};
@@ -19,6 +19,13 @@ use voxcast_kernels::depthwise_i8::{DepthwiseI8 as Kernel, depthwise_i8};
 pub struct DepthwiseI8 {
     /// Taps along height and width.
     pub side: usize,
+}
+
+impl DepthwiseI8 {
+    fn dense(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Dense> {
+        let Recipe::Conv(names) = site.recipe else { unreachable!("one convolution, not {:?}", site.recipe) };
+        weights.dense(names, &[site.channels, 1, self.side, self.side], site.channels)
+    }
 }
 
 impl Description for DepthwiseI8 {
@@ -40,10 +47,9 @@ impl Description for DepthwiseI8 {
     }
 
     fn evaluate(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
-        let Recipe::Conv(names) = site.recipe else { unreachable!("one convolution, not {:?}", site.recipe) };
         let (taps, channels) = (self.side * self.side, site.channels);
-        let dense = weights.dense(names, &[channels, 1, self.side, self.side], channels)?;
-        let steps = Steps { input: step(site.input(0)), output: step(site.output()), residual: site.added().map(step) };
+        let dense = self.dense(site, weights)?;
+        let steps = Steps::of(site);
         let columns =
             dense.weight.chunks_exact(taps).zip(&dense.bias).map(|(weight, &bias)| steps.column(weight, bias));
         let columns: Vec<Column> = columns.collect::<Result<_>>()?;
@@ -54,6 +60,11 @@ impl Description for DepthwiseI8 {
             values.push(each(|c| c.residual));
         }
         Ok(values)
+    }
+
+    fn finest(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Option<f64>> {
+        let dense = self.dense(site, weights)?;
+        Ok(Some(product::finest(Steps::of(site), &dense.weight, &dense.bias)))
     }
 
     fn verify(&self, site: &Site<'_>, parts: &[Elements<'_>]) -> std::result::Result<(), String> {

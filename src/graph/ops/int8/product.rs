@@ -1,6 +1,6 @@
 //! What integer products have in common: stored parts, how they follow from the weights, and what is proved of them.
 
-use super::columns::Column;
+use super::columns::{Column, Steps};
 use super::integers;
 use crate::base::error::Result;
 use crate::graph::call::{Added, Call};
@@ -88,6 +88,12 @@ pub(super) fn columns(
         column(n, &ordered, bias)
     });
     columns.collect()
+}
+
+/// The finest step of an output to which sums of `dense` weights can be brought.
+pub(super) fn finest(steps: Steps, weight: &[f64], bias: &[f64]) -> f64 {
+    let columns = weight.chunks_exact(weight.len() / bias.len()).zip(bias);
+    columns.map(|(weight, &bias)| steps.finest(weight, bias)).fold(0.0, f64::max)
 }
 
 /// Checks what kernels take for granted of [`values`].
