@@ -59,7 +59,7 @@ impl Model {
     /// The file must not be changed while it is open; replacing it by renaming another over it is fine.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] if it cannot be mapped; [`ErrorKind::Format`] and what is wrong otherwise.
+    /// [`ErrorKind::Io`](crate::ErrorKind::Io) if it cannot be mapped; [`ErrorKind::Format`](crate::ErrorKind::Format) and what is wrong otherwise.
     pub fn open(path: &Path) -> Result<Self> {
         Self::of_file(Container::open(path)?, path)
     }
@@ -68,7 +68,7 @@ impl Model {
     /// whatever happens to the file; the weights are not shared with other processes.
     ///
     /// # Errors
-    /// As [`Model::open`]; [`ErrorKind::TooLarge`] if the system has no memory for it.
+    /// As [`Model::open`]; [`ErrorKind::TooLarge`](crate::ErrorKind::TooLarge) if the system has no memory for it.
     pub fn read(path: &Path) -> Result<Self> {
         Self::of_file(Container::read(path)?, path)
     }
@@ -156,7 +156,7 @@ impl Model {
     /// Writes the model to `path`, as it is, by way of a temporary file beside it.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`] if the system refuses.
+    /// [`ErrorKind::Io`](crate::ErrorKind::Io) if the system refuses.
     pub fn save(&self, path: &Path) -> Result<()> {
         let tensors = self.contents().map(|(name, dtype, shape, bytes)| {
             let shape = shape.to_vec();
@@ -183,7 +183,7 @@ impl Model {
     /// The self-test that the model carries, if any.
     ///
     /// # Errors
-    /// [`ErrorKind::Format`] if it is malformed.
+    /// [`ErrorKind::Format`](crate::ErrorKind::Format) if it is malformed.
     pub fn self_test(&self) -> Result<Option<SelfTest>> {
         let Some(text) = self.container.metadata().get(selftest::KEY) else { return Ok(None) };
         let malformed = |e: serde_json::Error| {
@@ -263,7 +263,7 @@ pub(crate) fn tensor<'a>(name: String, part: &Part, precision: Precision, data: 
 /// Writes the bytes of a model, such as one built into a program, to `path`, by way of a temporary file beside it.
 ///
 /// # Errors
-/// [`ErrorKind::Io`] if the system refuses; [`ErrorKind::Format`] for bytes that are no model.
+/// [`ErrorKind::Io`](crate::ErrorKind::Io) if the system refuses; [`ErrorKind::Format`](crate::ErrorKind::Format) for bytes that are no model.
 pub fn write_bytes(path: &Path, bytes: &'static [u8]) -> Result<()> {
     Model::from_bytes(bytes)?.save(path)
 }

@@ -1,4 +1,4 @@
-//! [Convolution](crate::conv()) of an 8-bit tensor: the same walk over the input, sums that are exact.
+//! [Convolution](mod@crate::conv) of an 8-bit tensor: the same walk over the input, sums that are exact.
 //!
 //! ```text
 //! sum[d, h, w][n] = bias[n] + sum over (kd, kh, kw, c) of

@@ -1,4 +1,4 @@
-//! [Transposed convolution](crate::deconv3d()) of an 8-bit tensor: kernel 4, stride 2, padding 1, eight plain convolutions.
+//! [Transposed convolution](mod@crate::deconv3d) of an 8-bit tensor: kernel 4, stride 2, padding 1, eight plain convolutions.
 //!
 //! ```text
 //! sum[2i + p] = bias + sum over taps t in {0, 1} per axis and c of x[i + t - 1 + p][c] * weight[3 - p - 2t][c]

@@ -1,4 +1,4 @@
-//! [Modulated deformable convolution](crate::deform_conv2d()) of an 8-bit tensor: sampling in fixed point, then the product
+//! [Modulated deformable convolution](mod@crate::deform_conv2d) of an 8-bit tensor: sampling in fixed point, then the product
 //! of [`crate::product::int8`].
 //!
 //! ```text

@@ -1,4 +1,4 @@
-//! The [occupancy head](crate::head()) in 8 bits: three linear layers per voxel, ReLU after the first two, and the largest
+//! The [occupancy head](mod@crate::head) in 8 bits: three linear layers per voxel, ReLU after the first two, and the largest
 //! class.
 //!
 //! ```text
