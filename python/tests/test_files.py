@@ -34,7 +34,7 @@ NETWORK = {
 def test_a_model_says_what_it_is(program, model):
     assert model.checksum in program("inspect", model.path)
     assert model.network["cameras"] == model.cameras == 6
-    assert model.image_size == (128, 352) and model.precision in ("f32", "f16")
+    assert model.image_size == (192, 544) and model.precision in ("f32", "f16")
     assert len(model.bounds) == 3 and len(model.classes) == 17
     assert model.selftest(threads=1) > 50
     assert voxcast.Model.open(model.path, copy=True).checksum == model.checksum

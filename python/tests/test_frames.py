@@ -43,9 +43,9 @@ def test_digests_are_those_of_the_command_line(program, place, model, scene, rig
 def test_images_of_any_strides_give_the_same_bits(session, scene):
     expected = session.run(scene).digest
     bgr = numpy.stack(scene.images)
-    assert bgr.shape == (6, 128, 352, 3)
-    wide = numpy.full((6, 130, 400, 4), 77, numpy.uint8)
-    wide[:, 1:129, 20:372, :3] = bgr
+    assert bgr.shape == (6, 192, 544, 3)
+    wide = numpy.full((6, 194, 600, 4), 77, numpy.uint8)
+    wide[:, 1:193, 20:564, :3] = bgr
     planes = numpy.ascontiguousarray(bgr.transpose(0, 3, 1, 2))
     upside_down = numpy.ascontiguousarray(bgr[:, ::-1])
     rgb = numpy.ascontiguousarray(bgr[..., ::-1])
@@ -53,7 +53,7 @@ def test_images_of_any_strides_give_the_same_bits(session, scene):
         (bgr, "bgr"),
         (rgb, "rgb"),
         (rgb[..., ::-1], "bgr"),
-        (wide[:, 1:129, 20:372, :3], "bgr"),
+        (wide[:, 1:193, 20:564, :3], "bgr"),
         (planes.transpose(0, 2, 3, 1), "bgr"),
         (upside_down[:, ::-1], "bgr"),
         (numpy.asfortranarray(bgr), "bgr"),
@@ -72,13 +72,13 @@ def test_what_is_no_image_is_refused_in_one_line(session, scene):
         (bgr, None, TypeError, 'give order="bgr" or order="rgb"'),
         (bgr, "gbr", ValueError, 'order: found "gbr"'),
         (scene, "bgr", TypeError, "a scene knows its own"),
-        (bgr.astype(numpy.float32), "bgr", TypeError, "images: found float32 [6, 128, 352, 3], expected uint8"),
-        (bgr[0], "bgr", TypeError, "images: found uint8 [128, 352, 3], expected uint8 [cameras,"),
-        (bgr[..., :2], "bgr", voxcast.MismatchError, "image 0: shape [128, 352, 2]"),
+        (bgr.astype(numpy.float32), "bgr", TypeError, "images: found float32 [6, 192, 544, 3], expected uint8"),
+        (bgr[0], "bgr", TypeError, "images: found uint8 [192, 544, 3], expected uint8 [cameras,"),
+        (bgr[..., :2], "bgr", voxcast.MismatchError, "image 0: shape [192, 544, 2]"),
         (bgr[:5], "bgr", voxcast.MismatchError, "5 images, the rig has 6 cameras"),
-        (bgr[:, :64], "bgr", voxcast.MismatchError, "image 0: 64x352 (height x width)"),
-        ([bgr[0]] * 5 + [bgr], "bgr", TypeError, "image 5: found uint8 [6, 128, 352, 3], expected uint8 [height"),
-        (numpy.zeros((0, 128, 352, 3), numpy.uint8), "bgr", voxcast.MismatchError, "0 images"),
+        (bgr[:, :64], "bgr", voxcast.MismatchError, "image 0: 64x544 (height x width)"),
+        ([bgr[0]] * 5 + [bgr], "bgr", TypeError, "image 5: found uint8 [6, 192, 544, 3], expected uint8 [height"),
+        (numpy.zeros((0, 192, 544, 3), numpy.uint8), "bgr", voxcast.MismatchError, "0 images"),
         (7, "bgr", TypeError, "int"),
     ]:
         with pytest.raises(kind) as raised:
@@ -156,7 +156,7 @@ def test_cameras_one_by_one(model, rig, scene):
 
     for wrong, text in [
         (lambda: session.set_camera(6, scene.images[0], order="bgr"), "camera 6, the rig has 6 cameras"),
-        (lambda: session.set_camera(0, scene.images[0][:64], order="bgr"), "image 0: 64x352"),
+        (lambda: session.set_camera(0, scene.images[0][:64], order="bgr"), "image 0: 64x544"),
         (lambda: session.mask(9), "camera 9"),
         (lambda: session.step(seconds=-1.0), "seconds: found -1"),
         (lambda: session.step(seconds=1.0, slices=3), "expected one of them"),

@@ -174,7 +174,6 @@ impl<'a, V: Vocabulary> Pickle<'a, V> {
     }
 
     /// The elements of a tuple or list.
-    #[cfg(feature = "import")]
     pub(crate) fn sequence(&self, id: Id) -> Option<&[Id]> {
         sequence(&self.values, id)
     }
@@ -525,6 +524,7 @@ impl<'a, V: Vocabulary> Machine<'a, V> {
     }
 
     /// The elements of a tuple or list.
+    #[cfg(feature = "import")]
     pub(crate) fn sequence(&self, id: Id) -> Option<&[Id]> {
         sequence(&self.values, id)
     }
