@@ -121,9 +121,9 @@ impl Run<'_> {
                     factors: three(&case.integers("factors", 3, normalise_i8::MAX_FACTOR, false)),
                     offsets: three(&case.integers("offsets", 3, normalise_i8::MAX_OFFSET, true)),
                 };
-                let mut out = vec![JUNK; rows * columns * 4];
+                let mut out = vec![JUNK; rows * columns * 3];
                 normalise_i8(&args, &case.bytes(height * width * 3), [height, width], columns, 0, &mut out);
-                channels_first(&out, 4)
+                channels_first(&out, 3)
             }
             Kind::Conv(conv) => self.conv(&conv),
             Kind::DeformConv { .. } => self.deform_conv(),

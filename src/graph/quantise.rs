@@ -15,7 +15,6 @@ use super::scale::Scale;
 use super::tensor::{Lifetime, Tensor, TensorId};
 use crate::base::error::{Error, ErrorKind, Result};
 use std::collections::BTreeMap;
-use voxcast_kernels::conv::Geometry;
 
 /// Channels of tensors that integer products read come in multiples of this.
 const CHANNEL_GROUP: usize = 4;
@@ -78,11 +77,6 @@ impl Graph {
             if !kept {
                 self.operations[index].op = self.in_integers(&self.operations[index], &signed, scale)?;
             }
-        }
-        // The image's fourth channel.
-        let images = self.operations.iter().filter(|o| matches!(o.op, Op::NormaliseI8(_))).map(Operation::output);
-        for TensorId(image) in images.collect::<Vec<_>>() {
-            self.tensors[image].channels = self.tensors[image].channels.next_multiple_of(CHANNEL_GROUP);
         }
         self.convert(&kept, &scaled, scale)?;
         Ok(self)
@@ -241,11 +235,7 @@ impl Graph {
         let signed = operation.inputs.first().is_some_and(|x| signed[x.0]);
         Ok(match operation.op.clone() {
             Op::Normalise(_) => NormaliseI8.into(),
-            Op::Conv(conv) => {
-                let inputs = conv.geometry.channels;
-                let geometry = Geometry { channels: inputs.next_multiple_of(CHANNEL_GROUP), ..conv.geometry };
-                ConvI8 { geometry, signed, inputs }.into()
-            }
+            Op::Conv(conv) => ConvI8 { geometry: conv.geometry, signed }.into(),
             Op::DeformConv(conv) => DeformConvI8 { geometry: conv.geometry, signed }.into(),
             Op::Depthwise(depthwise) => DepthwiseI8 { side: depthwise.side }.into(),
             Op::MaxPool(pool) => MaxPoolI8 { side: pool.side, stride: pool.stride, padding: pool.padding }.into(),

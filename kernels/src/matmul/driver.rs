@@ -26,8 +26,8 @@ const LINE: usize = 64;
 /// Bytes between the end of a row of a block and the start of the next, which keep rows from falling into the same cache
 /// set.
 const GAP_BYTES: usize = LINE;
-/// Pieces of a k block. Shorter pieces than an eighth of it are better copied together.
-pub(crate) const PIECES: usize = 8;
+/// Pieces of a k block, at most: the runs of taps of a 3x3x3 kernel.
+const PIECES: usize = 9;
 
 /// Most values of k per block, for all panels of a tile together, where an element of the left matrix and of the panels is
 /// an `E`.

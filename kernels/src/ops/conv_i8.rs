@@ -6,7 +6,8 @@
 //! out[d, h, w][n] = clamp(requantise(end(sum), multiplier[n]))                 i8, or i32 without the clamp
 //! ```
 //!
-//! Taps outside the input count as x = 0. Channels are a multiple of 4. The rest is the product's:
+//! Taps outside the input count as x = 0. Channels are a multiple of 4, or there are so few that the channels of all taps along
+//! the last axis are less than 48: an image's three. The depth is rounded up to a multiple of 4. The rest is the product's:
 //! [`crate::product::int8`].
 
 use crate::isa::Isa;
@@ -23,7 +24,7 @@ pub struct ConvI8<'a> {
     pub geometry: Geometry,
     /// `[depth, height, width, channels]`, -127..=127.
     pub input: &'a [i8],
-    /// Weights, bias and what becomes of the sums.
+    /// Weights, of [`Geometry::depth_i8`] and 0 from [`Geometry::depth`] on, bias and what becomes of the sums.
     pub product: ProductI8<'a>,
 }
 
@@ -31,7 +32,7 @@ pub struct ConvI8<'a> {
 /// `stride` values apart. `scratch` holds [`crate::product::int8::scratch_len`] values of any value.
 ///
 /// # Panics
-/// If a slice does not have the size that the shapes ask for, or the channels are no multiple of 4.
+/// If a slice does not have the size that the shapes ask for, or the channels are many and no multiple of 4.
 ///
 /// # Determinism
 /// The same bits on every instruction set and for every division into rows.
@@ -69,8 +70,8 @@ impl ConvI8<'_> {
     ) {
         let Self { geometry, input, product } = *self;
         geometry.check(input);
-        geometry.check_groups();
-        assert_eq!(product.depth, geometry.depth(), "the weights belong to another kernel");
+        geometry.check_runs();
+        assert_eq!(product.depth, geometry.depth_i8(), "the weights belong to another kernel");
         let (product, source) = (product.to::<O>(), Walk { geometry, input });
         Rows { product: &product, source: &source, rows, stride, out, scratch }.compute(isa, geometry.rows());
     }

@@ -1,4 +1,4 @@
-//! Camera bytes to 8-bit network input of four channels, the last of them 0; zeros below and to the right.
+//! Camera bytes to 8-bit network input; zeros below and to the right.
 //!
 //! ```text
 //! out[y][x][c] = clamp((image[y][x][c] * factors[c] + offsets[c] + 2^19) >> 20)            rounded once, halves upwards
@@ -37,7 +37,7 @@ impl NormaliseI8 {
     }
 }
 
-/// Rows `first_row..` of the padded image into `out`, which holds whole rows of `padded_width` pixels of four channels.
+/// Rows `first_row..` of the padded image into `out`, which holds whole rows of `padded_width` pixels.
 ///
 /// `image` is `[height, width, 3]` blue first. Rows from `height` on, and pixels from `width` on, are zero.
 ///
@@ -64,7 +64,7 @@ pub fn normalise_i8(
     }
     let [blue, green, red] = tables;
     fill(image, [height, width], padded_width, first_row, out, |[b, g, r]| {
-        [blue[usize::from(b)], green[usize::from(g)], red[usize::from(r)], 0]
+        [blue[usize::from(b)], green[usize::from(g)], red[usize::from(r)]]
     });
 }
 
@@ -82,18 +82,18 @@ mod tests {
         let image: Vec<u8> = (0..12).map(|i| i * 10).collect();
         // Half of blue less 3, green less 100, three times red.
         let args = NormaliseI8 { factors: [UNIT / 2, UNIT, 3 * UNIT], offsets: [-3 * UNIT, -100 * UNIT, 0] };
-        let mut out = vec![9; 3 * 3 * 4];
+        let mut out = vec![9; 3 * 3 * 3];
         normalise_i8(&args, &image, [2, 2], 3, 0, &mut out);
-        assert_eq!(out[..12], [-3, -90, 60, 0, 12, -60, 127, 0, 0, 0, 0, 0]);
-        assert_eq!(out[12..24], [27, -30, 127, 0, 42, 0, 127, 0, 0, 0, 0, 0]);
-        assert_eq!(out[24..], [0; 12]);
-        let mut last = vec![9; 12];
+        assert_eq!(out[..9], [-3, -90, 60, 12, -60, 127, 0, 0, 0]);
+        assert_eq!(out[9..18], [27, -30, 127, 42, 0, 127, 0, 0, 0]);
+        assert_eq!(out[18..], [0; 9]);
+        let mut last = vec![9; 9];
         normalise_i8(&args, &image, [2, 2], 3, 1, &mut last);
-        assert_eq!(last, out[12..24]);
+        assert_eq!(last, out[9..18]);
         // 1/2 - 1/2 and -3/2: halves go upwards.
         let args = NormaliseI8 { factors: [UNIT / 2; 3], offsets: [-UNIT / 2, -2 * UNIT, -200 * UNIT] };
-        normalise_i8(&args, &[1, 1, 1], [1, 1], 1, 0, &mut out[..4]);
-        assert_eq!(out[..4], [0, -1, -127, 0]);
+        normalise_i8(&args, &[1, 1, 1], [1, 1], 1, 0, &mut out[..3]);
+        assert_eq!(out[..3], [0, -1, -127]);
     }
 
     /// Every byte, against the floating-point input divided by its scale.
@@ -105,14 +105,11 @@ mod tests {
         for scale in [0.25, 1.196_2, 2.0, 37.5] {
             let fixed = |x: f64| (x / scale * f64::from(UNIT)).round() as i32;
             let args = NormaliseI8 { factors: [fixed(1.0); 3], offsets: BGR_MEAN.map(|mean| fixed(-f64::from(mean))) };
-            let mut out = vec![9; 256 * 4];
+            let mut out = vec![9; 256 * 3];
             normalise_i8(&args, &image, [1, 256], 256, 0, &mut out);
-            for (got, real) in out.chunks_exact(4).zip(real.chunks_exact(3)) {
-                assert_eq!(got[3], 0);
-                for (got, real) in got.iter().zip(real) {
-                    let exact = (f64::from(*real) / scale).clamp(-127.0, 127.0);
-                    assert!((f64::from(*got) - exact).abs() < 0.5 + 1.0 / 4096.0, "{got} is not {exact}");
-                }
+            for (got, real) in out.iter().zip(&real) {
+                let exact = (f64::from(*real) / scale).clamp(-127.0, 127.0);
+                assert!((f64::from(*got) - exact).abs() < 0.5 + 1.0 / 4096.0, "{got} is not {exact}");
             }
         }
     }
@@ -123,10 +120,10 @@ mod tests {
             [(MAX_FACTOR, MAX_OFFSET, 127), (MAX_FACTOR, -MAX_OFFSET, -4), (0, -MAX_OFFSET, -127)]
         {
             let args = NormaliseI8 { factors: [factor; 3], offsets: [offset; 3] };
-            let mut out = [9; 4];
+            let mut out = [9; 3];
             normalise_i8(&args, &[255; 3], [1, 1], 1, 0, &mut out);
             // 255 * 4 - 1024 = -4.
-            assert_eq!(out, [want, want, want, 0]);
+            assert_eq!(out, [want; 3]);
         }
         assert!(255 * i64::from(MAX_FACTOR) + i64::from(MAX_OFFSET) + i64::from(UNIT / 2) < 1 << 31);
     }
@@ -139,7 +136,7 @@ mod tests {
 
     #[test]
     #[should_panic(expected = "the output is not whole rows")]
-    fn three_channels() {
-        normalise_i8(&NormaliseI8 { factors: [0; 3], offsets: [0; 3] }, &[0; 3], [1, 1], 1, 0, &mut [0; 3]);
+    fn four_channels() {
+        normalise_i8(&NormaliseI8 { factors: [0; 3], offsets: [0; 3] }, &[0; 3], [1, 1], 1, 0, &mut [0; 4]);
     }
 }

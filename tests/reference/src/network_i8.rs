@@ -206,7 +206,7 @@ impl Run<'_> {
         let packed = self.part(operation, name)?;
         let at = |i: usize| {
             let (n, c, tap) = (i / (inputs * taps), i / taps % inputs, i % taps);
-            packed[place_of(taps * inputs, tap * inputs + c, n)]
+            packed[place_of((taps * inputs).next_multiple_of(4), tap * inputs + c, n)]
         };
         Ok(self.gpu.upload(&(0..outputs * inputs * taps).map(at).collect::<Vec<_>>()))
     }

@@ -143,14 +143,14 @@ pub fn broadcast(gpu: &Gpu, x: &Tensor, extent: [usize; 3]) -> Tensor {
     Tensor::of(extent, x.channels, buffer)
 }
 
-/// Image bytes, blue first, times factors and plus offsets (`[2, 3]`), padded with zeros, and a fourth channel of zeros.
+/// Image bytes, blue first, times factors and plus offsets (`[2, 3]`), padded with zeros.
 pub fn normalise(gpu: &Gpu, bgr: &[u8], [height, width]: [usize; 2], padded: [usize; 2], factors: &[i32]) -> Tensor {
     assert!(bgr.len() == height * width * 3 && factors.len() == 6, "an image of another size");
     let image: Vec<u32> = bgr.iter().map(|&b| u32::from(b)).collect();
     let shape = words([height, width, padded[0], padded[1]]);
     let inputs = [&gpu.upload(&image), &gpu.upload(factors)];
-    let buffer = gpu.run("normalise_i8", &shape, &inputs, 4 * padded[0] * padded[1]);
-    Tensor::of([1, padded[0], padded[1]], 4, buffer)
+    let buffer = gpu.run("normalise_i8", &shape, &inputs, 3 * padded[0] * padded[1]);
+    Tensor::of([1, padded[0], padded[1]], 3, buffer)
 }
 
 /// Three linear layers with ReLUs between; the weights of each, and `[2, outputs]`: bias and multiplier. The sums of the last

@@ -1,9 +1,14 @@
 //! How convolutions walk their input, whatever it is made of.
 
-use crate::matmul::driver::{PIECES, Source, depth};
+use crate::matmul::driver::{Source, depth};
 use crate::simd::bytes::GROUP;
 use crate::simd::{LANES, Simd};
 use core::ops::Range;
+
+/// Elements that are better copied together with those that follow than given a pointer of their own.
+const SHORT: usize = 3 * LANES;
+/// Runs of taps that are each given a pointer even where copied together they would be few elements.
+const FEW_RUNS: usize = 3;
 
 /// How a convolution walks its input. The axes are depth, height, width.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -42,10 +47,29 @@ impl Geometry {
         [row / (h * w), row / w % h, row % w]
     }
 
+    /// [`Geometry::depth`] of bytes, which are multiplied in fours: rounded up, with weights of 0.
+    pub fn depth_i8(&self) -> usize {
+        self.depth().next_multiple_of(GROUP)
+    }
+
+    /// Taps that lie side by side in memory.
+    #[inline(always)]
+    fn run_taps(&self) -> usize {
+        if self.dilation[2] == 1 { self.kernel[2] } else { 1 }
+    }
+
     /// # Panics
     /// If the channels are no multiple of 4, which products of bytes take at once.
     pub(crate) fn check_groups(&self) {
         assert!(self.channels.is_multiple_of(GROUP), "the channels are no multiple of 4");
+    }
+
+    /// # Panics
+    /// If fours of bytes would reach from a run of taps into the next one where the two are not copied side by side.
+    pub(crate) fn check_runs(&self) {
+        if self.run_taps() * self.channels >= SHORT {
+            self.check_groups();
+        }
     }
 
     /// # Panics
@@ -95,10 +119,12 @@ pub(crate) struct Walk<'a, E> {
 }
 
 impl<E: Copy + Default> Walk<'_, E> {
-    /// Taps that lie side by side in memory.
+    /// Whether runs of taps are copied side by side: where they are short, or where they are many and not long.
     #[inline(always)]
-    fn run_taps(&self) -> usize {
-        if self.geometry.dilation[2] == 1 { self.geometry.kernel[2] } else { 1 }
+    fn copies(&self) -> bool {
+        let g = &self.geometry;
+        let (len, count) = (g.run_taps() * g.channels, g.kernel.iter().product::<usize>() / g.run_taps());
+        len < SHORT || count > FEW_RUNS && len * 8 < depth::<E>()
     }
 
     /// The `len` elements from `stretch` on within one run: where they start in the input, if all of them are in it,
@@ -123,16 +149,46 @@ impl<E: Copy + Default> Walk<'_, E> {
         Err((before as usize..end as usize, base.wrapping_add_signed(start + before)))
     }
 
-    /// Writes the elements from `stretch` on, over as many runs as it takes.
+    /// Where the first tap of position `at` lies, if all of them are in the input.
+    #[inline(always)]
+    fn inside(&self, at: [usize; 3]) -> Option<usize> {
+        let g = &self.geometry;
+        let mut origin = 0;
+        for axis in 0..3 {
+            let first = (at[axis] * g.stride[axis]).wrapping_sub(g.padding[axis]);
+            let last = first.wrapping_add((g.kernel[axis] - 1) * g.dilation[axis]);
+            if first >= g.input[axis] || last >= g.input[axis] {
+                return None;
+            }
+            origin = origin * g.input[axis] + first;
+        }
+        Some(origin * g.channels)
+    }
+
+    /// Writes the elements from `stretch` on, over as many runs as it takes; zeros behind the last one.
     #[inline(always)]
     fn write(&self, at: [usize; 3], mut stretch: Stretch, mut out: &mut [E]) {
         let g = &self.geometry;
-        let taps = self.run_taps();
+        let taps = g.run_taps();
+        let line = g.input[2] * g.channels;
+        let steps = [g.dilation[0] * g.input[1] * line, g.dilation[1] * line, g.dilation[2] * g.channels];
+        let inside = self.inside(at);
         while !out.is_empty() {
+            if stretch.tap[0] == g.kernel[0] {
+                out.fill(E::default());
+                return;
+            }
             let len = (taps * g.channels - stretch.skip).min(out.len());
             let (part, rest) = out.split_at_mut(len);
             out = rest;
-            match self.locate(at, stretch, len) {
+            let found = match inside {
+                Some(first) => {
+                    let [a, b, c] = stretch.tap;
+                    Ok(first + a * steps[0] + b * steps[1] + c * steps[2] + stretch.skip)
+                }
+                None => self.locate(at, stretch, len),
+            };
+            match found {
                 Ok(start) => copy(&self.input[start..start + len], part),
                 Err((inside, start)) => {
                     part[..inside.start].fill(E::default());
@@ -161,6 +217,9 @@ impl<E: Copy + Default> Source for Walk<'_, E> {
     #[inline(always)]
     fn element(&self, row: usize, k: usize) -> E {
         let g = &self.geometry;
+        if k >= g.depth() {
+            return E::default();
+        }
         let (tap, c) = (k / g.channels, k % g.channels);
         let tap = [tap / (g.kernel[1] * g.kernel[2]), tap / g.kernel[2] % g.kernel[1], tap % g.kernel[2]];
         let position = g.position(row);
@@ -193,19 +252,19 @@ impl<E: Copy + Default> Source for Walk<'_, E> {
     #[inline(always)]
     fn part(&self, k: usize) -> (Stretch, usize) {
         let g = &self.geometry;
-        let taps = self.run_taps();
+        let taps = g.run_taps();
         let run = taps * g.channels;
         let (index, skip) = (k / run, k % run);
         let across = g.kernel[2] / taps;
         let tap = [index / (across * g.kernel[1]), index / across % g.kernel[1], index % across * taps];
-        let most = if run * PIECES < depth::<E>() { depth::<E>() } else { run - skip };
+        let most = if self.copies() { depth::<E>() } else { run - skip };
         (Stretch { tap, skip }, most)
     }
 
     #[inline(always)]
     fn piece<'a, S: Simd>(&'a self, _: S, at: [usize; 3], stretch: Stretch, spare: &'a mut [E]) -> &'a [E] {
         let len = spare.len();
-        if stretch.skip + len <= self.run_taps() * self.geometry.channels
+        if stretch.skip + len <= self.geometry.run_taps() * self.geometry.channels
             && let Ok(start) = self.locate(at, stretch, len)
         {
             return &self.input[start..start + len];

@@ -25,12 +25,12 @@ pub(crate) fn draw(draw: &mut Draw) -> Option<impl Case + use<>> {
     let mut three = |low, high| core::array::from_fn(|_| draw.extent(low, high));
     let (output, kernel) = (three(1, 6), three(1, 3));
     let (stride, dilation, padding, input) = (three(1, 3), three(1, 3), three(0, 3), three(1, 6));
-    let channels = 4 * draw.extent(1, 30);
+    let channels = if draw.flag() { draw.extent(1, 15) } else { 4 * draw.extent(1, 30) };
     let g = Geometry { input, channels, kernel, stride, dilation, padding, output };
-    let columns = draw.columns(g.rows() * g.depth())?;
+    let columns = draw.columns(g.rows() * g.depth_i8())?;
     let rows = draw.rows(g.rows());
     let stride = columns + draw.extent(0, 3);
-    let right = RightI8::draw(draw, g.rows(), g.depth(), columns);
+    let right = RightI8::draw(draw, g.rows(), g.depth_i8(), columns);
     Some(Call {
         geometry: g,
         input: left(draw, input.iter().product::<usize>() * channels, right.signed),
@@ -60,15 +60,13 @@ impl Case for Call {
     }
 }
 
-/// The convolutions of f32, an image of three channels having a fourth. The first of them reads signed elements, the others
-/// what ReLU left.
+/// The convolutions of f32. That of an image reads signed elements, the others what ReLU left.
 pub(crate) fn benches() -> Vec<Bench> {
     cases::shapes().into_iter().map(|(name, geometry, columns)| bench(name, geometry, columns)).collect()
 }
 
 fn bench(name: &str, geometry: Geometry, columns: usize) -> Bench {
-    let geometry = Geometry { channels: geometry.channels.next_multiple_of(4), ..geometry };
-    let (rows, depth, signed) = (geometry.rows(), geometry.depth(), geometry.channels == 4);
+    let (rows, depth, signed) = (geometry.rows(), geometry.depth_i8(), geometry.channels == 3);
     let mut input = bytes(geometry.input.iter().product::<usize>() * geometry.channels);
     input.iter_mut().filter(|_| !signed).for_each(|x| *x = (*x).max(0));
     let right = RightI8::bench(depth, columns, signed);

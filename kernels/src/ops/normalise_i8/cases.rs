@@ -34,7 +34,7 @@ impl Case for Call {
     /// There is one body for all instruction sets.
     fn run(&self, _: Isa, memory: Memory) -> Output {
         let image = memory.hold(&self.image);
-        let mut out = memory.filled(self.rows.len() * self.padded_width * 4, 55i8);
+        let mut out = memory.filled(self.rows.len() * self.padded_width * 3, 55i8);
         normalise_i8(&self.args, &image, [self.height, self.width], self.padded_width, self.rows.start, &mut out);
         Output::from(&out[..])
     }
@@ -45,7 +45,7 @@ pub(crate) fn benches() -> Vec<Bench> {
     let (height, width) = (900, 1600);
     let image: Vec<u8> = (0..height * width * 3).map(|i| (i * 7 % 256) as u8).collect();
     let args = NormaliseI8 { factors: [900_000; 3], offsets: [-90_000_000; 3] };
-    vec![Bench::new("900 x 1600", [928, width * 4], 0, image.len(), move |_, rows, out| {
+    vec![Bench::new("900 x 1600", [928, width * 3], 0, image.len(), move |_, rows, out| {
         normalise_i8(&args, &image, [height, width], width, rows.start, out);
     })]
 }

@@ -185,8 +185,8 @@ unsafe fn dot<const N: usize, const P: usize, const SIGNED: bool>(
             for j in 0..P {
                 let w = load(panels[j].add(group * STEP));
                 for r in 0..N {
-                    let a = splat(left[r].add(group * GROUP));
-                    let a = if SIGNED { _mm256_xor_si256(a, shift) } else { a };
+                    let row = left[r].add(group * GROUP);
+                    let a = if SIGNED { _mm256_xor_si256(splat_first(row), shift) } else { splat(row) };
                     for half in 0..2 {
                         sums[r][j][half] = dpbusd(sums[r][j][half], a, w[half]);
                     }
@@ -195,6 +195,23 @@ unsafe fn dot<const N: usize, const P: usize, const SIGNED: bool>(
         }
     }
     sums
+}
+
+/// [`splat`] of bytes that are changed afterwards: compilers would change four of them and copy those into the lanes, which takes
+/// one instruction more and occupies a multiplier's port.
+///
+/// # Safety
+/// `row` must be valid for reading 4 bytes; the CPU must have AVX2.
+#[inline]
+#[target_feature(enable = "avx2")]
+unsafe fn splat_first(row: *const i8) -> __m256i {
+    let all;
+    // SAFETY: the caller promises the bytes, which need no alignment; only `all` changes.
+    unsafe {
+        asm!("vpbroadcastd {all}, dword ptr [{row}]", all = lateout(ymm_reg) all, row = in(reg) row,
+            options(pure, readonly, nostack, preserves_flags));
+    }
+    all
 }
 
 /// `sum + a * w` of unsigned and signed bytes, modulo 2^32. Not the intrinsic: it could not be inlined into a function that

@@ -6,8 +6,8 @@ use crate::simd::{LANES, TileRows};
 use core::arch::asm;
 use core::arch::x86_64::*;
 
-/// Rows of a tile of two panels: sixteen sums keep two multipliers of five cycles busy, and leave registers for two groups of
-/// weights.
+/// Rows of a tile of two panels: sixteen sums keep two multipliers of five cycles busy. With more, the ends of the sums and
+/// the rows' addresses no longer fit into registers, which costs a quarter of the time where sums have few products.
 pub(crate) const TILE_ROWS: usize = 8;
 
 #[inline(always)]
@@ -187,8 +187,8 @@ unsafe fn dot<const N: usize, const P: usize, const SIGNED: bool>(
         for group in 0..depth / GROUP {
             let w = Weights::group(panels, group * STEP);
             for r in 0..N {
-                let a = splat(left[r].add(group * GROUP));
-                let a = if SIGNED { _mm512_xor_si512(a, shift) } else { a };
+                let row = left[r].add(group * GROUP);
+                let a = if SIGNED { splat_xor(row, shift) } else { splat(row) };
                 for j in 0..P {
                     sums[r][j] = dpbusd(sums[r][j], a, w[j].0);
                 }
@@ -196,6 +196,23 @@ unsafe fn dot<const N: usize, const P: usize, const SIGNED: bool>(
         }
     }
     sums
+}
+
+/// Four elements of a row in all lanes, with the bits of `mask` changed. In one instruction: compilers change four bytes first and
+/// copy them into the lanes afterwards, which takes three and occupies a multiplier's port.
+///
+/// # Safety
+/// `row` must be valid for reading 4 bytes; the CPU must have AVX-512 F.
+#[inline]
+#[target_feature(enable = "avx512f")]
+unsafe fn splat_xor(row: *const i8, mask: __m512i) -> __m512i {
+    let all;
+    // SAFETY: the caller promises the bytes, which need no alignment; only `all` changes.
+    unsafe {
+        asm!("vpxord {all}, {mask}, dword ptr [{row}]{{1to16}}", all = lateout(zmm_reg) all, mask = in(zmm_reg) mask,
+            row = in(reg) row, options(pure, readonly, nostack, preserves_flags));
+    }
+    all
 }
 
 /// `sum + a * w` of unsigned and signed bytes, modulo 2^32. Not the intrinsic: it could not be inlined into a function that

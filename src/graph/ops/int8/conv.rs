@@ -6,7 +6,7 @@ use crate::base::error::Result;
 use crate::graph::call::{Call, Tile};
 use crate::graph::element::{Element, Elements};
 use crate::graph::ops::deform_conv::DeformConv;
-use crate::graph::ops::description::{Description, Machine};
+use crate::graph::ops::description::{Description, Machine, wide};
 use crate::graph::ops::product as floating;
 use crate::graph::parts::Part;
 use crate::graph::site::Site;
@@ -25,8 +25,6 @@ pub struct ConvI8 {
     pub geometry: Geometry,
     /// Whether x may be negative.
     pub signed: bool,
-    /// Channels of x that the checkpoint knows; those after are 0.
-    pub inputs: usize,
 }
 
 impl ConvI8 {
@@ -57,18 +55,18 @@ impl Description for ConvI8 {
     }
 
     fn parts(&self, site: &Site<'_>) -> Vec<Part> {
-        product::parts(1, self.geometry.depth(), site.channels, site.residual.is_some())
+        product::parts(1, self.geometry.depth_i8(), site.channels, site.residual.is_some())
     }
 
     fn evaluate(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
-        let dense = floating::dense(&self.geometry, self.inputs, site, weights)?;
+        let dense = floating::dense(&self.geometry, self.geometry.channels, site, weights)?;
         let steps = |n| match self.has_offsets(site) {
             true => Steps { output: self.offset_step(site, n), ..Steps::of(site) },
             false => Steps::of(site),
         };
-        let channels = [self.inputs, self.geometry.channels];
+        let inputs = self.geometry.channels;
         let columns =
-            product::columns(&dense.weight, &dense.bias, channels, |n, weight, bias| steps(n).column(weight, bias))?;
+            product::columns(&dense.weight, &dense.bias, inputs, |n, weight, bias| steps(n).column(weight, bias))?;
         Ok(product::values(1, &columns, site.residual.is_some()))
     }
 
@@ -76,24 +74,24 @@ impl Description for ConvI8 {
         if self.has_offsets(site) {
             return Ok(None);
         }
-        let dense = floating::dense(&self.geometry, self.inputs, site, weights)?;
+        let dense = floating::dense(&self.geometry, self.geometry.channels, site, weights)?;
         Ok(Some(product::finest(Steps::of(site), &dense.weight, &dense.bias)))
     }
 
     fn verify(&self, site: &Site<'_>, parts: &[Elements<'_>]) -> std::result::Result<(), String> {
-        product::verify(self.geometry.depth(), site.channels, parts)
+        product::verify(self.geometry.depth_i8(), site.channels, parts)
     }
 
     fn scratch(&self, site: &Site<'_>) -> usize {
-        product::scratch(self.geometry.depth(), site.channels)
+        product::scratch(self.geometry.depth_i8(), site.channels)
     }
 
     fn multiply_adds(&self, site: &Site<'_>) -> u128 {
-        floating::multiply_adds(&Geometry { channels: self.inputs, ..self.geometry }, site)
+        floating::multiply_adds(&self.geometry, site)
     }
 
     fn executed_multiply_adds(&self, site: &Site<'_>) -> u128 {
-        floating::multiply_adds(&self.geometry, site)
+        wide(site.rows()) * wide(self.geometry.depth_i8()) * wide(site.channels)
     }
 
     fn tile(&self, site: &Site<'_>, machine: Machine) -> usize {
@@ -101,7 +99,7 @@ impl Description for ConvI8 {
     }
 
     fn execute(&self, call: &Call<'_>, mut tile: Tile<'_>) {
-        let product = product::product(call, self.geometry.depth(), self.signed);
+        let product = product::product(call, self.geometry.depth_i8(), self.signed);
         let args = Kernel { geometry: self.geometry, input: call.input(0), product };
         if call.site.output().element == Element::I32 {
             let (rows, stride, out) = floating::rows(call, &mut tile);

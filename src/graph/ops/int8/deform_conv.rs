@@ -40,7 +40,7 @@ impl Description for DeformConvI8 {
         let dense = floating::dense(&self.geometry, channels, site, weights)?;
         let steps = Steps::of(site);
         let column = |_, weight: &[f64], bias| steps.column(weight, bias);
-        let columns = product::columns(&dense.weight, &dense.bias, [channels; 2], column)?;
+        let columns = product::columns(&dense.weight, &dense.bias, channels, column)?;
         Ok(product::values(1, &columns, site.residual.is_some()))
     }
 

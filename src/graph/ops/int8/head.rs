@@ -71,7 +71,7 @@ impl Description for HeadI8 {
             let most = dense.weight.iter().fold(0.0f64, |most, w| most.max(w.abs()));
             let common = Steps::common(inputs[layer], most, &dense.bias);
             let columns =
-                product::columns(&dense.weight, &dense.bias, [channels; 2], |_, weight, bias| match output {
+                product::columns(&dense.weight, &dense.bias, channels, |_, weight, bias| match output {
                     Some(output) => Steps { input: inputs[layer], output, residual: None }.column(weight, bias),
                     None => Ok(common.column(weight, bias)),
                 })?;

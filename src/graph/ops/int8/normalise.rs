@@ -11,8 +11,7 @@ use crate::graph::weights::{Values, Weights};
 use voxcast_kernels::normalise::BGR_MEAN;
 use voxcast_kernels::normalise_i8::{FRACTION, MAX_FACTOR, MAX_OFFSET, NormaliseI8 as Kernel, normalise_i8};
 
-/// [`voxcast_kernels::normalise_i8`]: the camera's bytes, blue first, dense and at most as large as the tensor, to four
-/// channels of which the last is 0.
+/// [`voxcast_kernels::normalise_i8`]: the camera's bytes, blue first, dense and at most as large as the tensor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct NormaliseI8;
 

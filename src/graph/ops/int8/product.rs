@@ -71,19 +71,19 @@ pub(super) fn values(panels: usize, columns: &[Column], residual: bool) -> Vec<V
     values
 }
 
-/// The columns of `dense` weights, `[outputs, inputs, taps]` in the checkpoint's order, with inputs padded to `padded`.
+/// The columns of `dense` weights, `[outputs, inputs, taps]` in the checkpoint's order, with zeros to a multiple of 4.
 pub(super) fn columns(
     weight: &[f64],
     bias: &[f64],
-    [inputs, padded]: [usize; 2],
+    inputs: usize,
     column: impl Fn(usize, &[f64], f64) -> Result<Column>,
 ) -> Result<Vec<Column>> {
     let depth = weight.len() / bias.len();
     let taps = depth / inputs;
-    let mut ordered = vec![0.0; taps * padded];
+    let mut ordered = vec![0.0; depth.next_multiple_of(4)];
     let columns = weight.chunks_exact(depth).zip(bias).enumerate().map(|(n, (weight, &bias))| {
         for (i, &w) in weight.iter().enumerate() {
-            ordered[i % taps * padded + i / taps] = w;
+            ordered[i % taps * inputs + i / taps] = w;
         }
         column(n, &ordered, bias)
     });
