@@ -235,7 +235,7 @@ typedef struct voxcast_options {
     /* 1 to keep logits as well as classes. Ignored by rig builders. */
     uint32_t logits;
     /*
-     * Work in one slice of voxcast_session_step, in multiply-adds; 0 for 100 million, a few milliseconds of one core. A
+     * Work in one slice of voxcast_session_step, in multiply-adds; 0 for 50 million, one or two milliseconds of one core. A
      * slice is at least one tile of an operation for every thread. Ignored by rig builders.
      */
     uint64_t slice_cost;

@@ -91,7 +91,9 @@ pub(crate) trait Simd: Copy {
         sums
     }
 
-    /// Rows of the largest register tile of bytes; its panels are those of [`Simd::TILE`].
+    /// Panels of the largest register tile of bytes.
+    const BYTE_PANELS: usize;
+    /// Rows of the largest register tile of bytes.
     fn byte_rows(self) -> usize;
     /// As [`Simd::rows`], for tiles of bytes.
     fn rows_of_bytes<B: TileRows<Self>>(self, left: usize, body: B) -> usize;

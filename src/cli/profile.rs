@@ -25,8 +25,8 @@ Examples:
   voxcast profile --model model.safetensors scene/ --slice 20 --by part    (how long can one step take?)
   voxcast profile --model model.safetensors scene/ --trace trace.json    (open in chrome://tracing or Perfetto)
 
-A step of a controller overruns its time by one slice at most. The column `slice` is the longest of each row, over as many
-frames as are timed, the line at the end the longest of all. On a shared machine, it holds what others did meanwhile.
+A step of a controller overruns its time by one slice at most. The column `slice` is the longest of each row, the median over
+as many frames as are timed, the line at the end the longest of all. On a shared machine, it holds what others did meanwhile.
 GMAC are billions of multiply-adds as the network has them; the share of the peak counts those that the kernels execute. For
 models of int8 there are two peaks, of f32 and of bytes, and the share is the time that the work would take at them.
 
@@ -66,7 +66,7 @@ pub struct Profile {
     #[arg(long)]
     unfolded: bool,
     /// Work in one slice of a step, in million multiply-adds; a slice is at least one tile for each thread
-    #[arg(long, value_name = "MILLIONS", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, value_name = "MILLIONS", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..))]
     slice: u32,
     /// Write the last frame as a Chrome trace
     #[arg(long, value_name = "FILE")]
@@ -92,8 +92,8 @@ struct Row {
 
 /// Frames in slices.
 struct Sliced {
-    /// Seconds of the longest slice of each operation.
-    longest: Vec<f64>,
+    /// Seconds of the longest slice of each operation, frame by frame.
+    longest: Vec<Vec<f64>>,
     /// Slices of a frame.
     slices: usize,
 }
@@ -136,7 +136,7 @@ impl Profile {
             frames.push(start.elapsed().as_secs_f64());
             bar.inc(1);
         }
-        let mut sliced = Sliced { longest: vec![0.0; graph.operations.len()], slices: 0 };
+        let mut sliced = Sliced { longest: vec![vec![]; graph.operations.len()], slices: 0 };
         for _ in 0..repeat {
             sliced.frame(&mut session, &images, &index_of)?;
             bar.inc(1);
@@ -147,15 +147,16 @@ impl Profile {
         }
         let peaks = peaks.map(|mut peaks| peaks.get_mut(1..).map(median));
         let frame = median(&mut frames[1..]);
-        let rows = self.rows(&graph, &seconds, &sliced, images.len());
-        let worst = (0..sliced.longest.len()).max_by(|&a, &b| sliced.longest[a].total_cmp(&sliced.longest[b]));
+        let longest: Vec<f64> = sliced.longest.iter_mut().map(|frames| median(frames)).collect();
+        let rows = self.rows(&graph, &seconds, &longest, images.len());
+        let worst = (0..longest.len()).max_by(|&a, &b| longest[a].total_cmp(&longest[b]));
         let worst = worst.map_or("", |index| &graph.operations[index].name);
         self.print(rows, frame, peaks, options.threads.count(), sliced.slices, worst);
         Ok(())
     }
 
     /// Table rows in running order.
-    fn rows(&self, graph: &Graph, seconds: &[Vec<f64>], sliced: &Sliced, cameras: usize) -> Vec<Row> {
+    fn rows(&self, graph: &Graph, seconds: &[Vec<f64>], longest: &[f64], cameras: usize) -> Vec<Row> {
         let mut rows: Vec<Row> = vec![];
         for (i, operation) in graph.operations.iter().enumerate() {
             let name = match self.by.as_str() {
@@ -167,7 +168,7 @@ impl Profile {
             let work = graph.multiply_adds(operation) * times;
             let mut executed = [0; 2];
             executed[usize::from(is_integer(graph, operation))] = graph.executed_multiply_adds(operation) * times;
-            let slice = sliced.longest[i];
+            let slice = longest[i];
             match rows.iter_mut().find(|r| r.name == name) {
                 Some(row) => {
                     row.multiply_adds += work;
@@ -263,9 +264,11 @@ impl Sliced {
             session.set_camera(camera, *image)?;
         }
         self.slices = 1;
+        self.longest.iter_mut().for_each(|frames| frames.push(0.0));
         let mut observe = |event: Event<'_>| {
-            let longest = &mut self.longest[index_of[event.operation.name.as_str()]];
-            *longest = longest.max(event.longest.as_secs_f64());
+            if let Some(longest) = self.longest[index_of[event.operation.name.as_str()]].last_mut() {
+                *longest = longest.max(event.longest.as_secs_f64());
+            }
         };
         while session.step_observed(Budget::Slices(1), &mut observe) == Step::Running {
             self.slices += 1;

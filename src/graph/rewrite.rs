@@ -63,14 +63,14 @@ impl Graph {
     /// Computes convolutions by Winograd's minimal filtering where [`Shape::best`] says so: from their shapes alone. What they
     /// read and write, and all that surrounds them, stays. Nothing that folds convolutions may come after it.
     ///
-    /// Transformed weights may take as much memory as the maps where every camera's pass reads them, and half as much where they
-    /// are read once in a frame.
+    /// Transformed weights may take three times the memory of the maps where every camera's pass reads them, and half as much as
+    /// the maps where they are read once in a frame.
     #[must_use]
     pub fn use_winograd(mut self) -> Self {
         for (index, operation) in self.operations.iter_mut().enumerate() {
             let Op::Conv(Conv { geometry }) = operation.op else { continue };
-            let share = if index < self.camera_operations { 1 } else { 2 };
-            if let Some(shape) = Shape::best(&geometry, operation.channels, share) {
+            let room = if index < self.camera_operations { [3, 1] } else { [1, 2] };
+            if let Some(shape) = Shape::best(&geometry, operation.channels, room) {
                 operation.op = Winograd { geometry, shape }.into();
             }
         }

@@ -59,7 +59,7 @@ impl Default for SessionOptions {
             unfolded: false,
             logits: false,
             coarse_heads: false,
-            slice_cost: 100_000_000,
+            slice_cost: 50_000_000,
         }
     }
 }

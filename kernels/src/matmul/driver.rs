@@ -202,11 +202,11 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
         W: Packed<S, Element = A::Right>,
         E: Epilogue<S, A>,
     {
-        const { assert!(1 <= S::TILE.panels && S::TILE.panels <= 2) }
+        const { assert!(1 <= A::PANELS && A::PANELS <= 2) }
         debug_assert!(BLOCK_ROWS.is_multiple_of(arithmetic.tile_rows(s)));
         let panels = self.columns.div_ceil(LANES);
         // Equal k blocks, as few as possible.
-        let most = depth::<A::Right>() / S::TILE.panels.min(panels.max(1));
+        let most = depth::<A::Right>() / A::PANELS.min(panels.max(1));
         let step = self.depth.div_ceil(self.depth.div_ceil(most).max(1)).next_multiple_of(LANES);
         let mut pieces = Pieces::new();
         let mut offsets = [0; BLOCK_ROWS];
@@ -231,7 +231,7 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
                 let mut panel = 0;
                 while panel < panels {
                     let (k, offsets) = (k..k + depth, &offsets[..count]);
-                    if S::TILE.panels == 2 && panels - panel >= 2 {
+                    if A::PANELS == 2 && panels - panel >= 2 {
                         self.panels::<A, S, E, _, 2>(s, arithmetic, &block, epilogue, panel, k, offsets, out, spare);
                         panel += 2;
                     } else {

@@ -104,6 +104,8 @@ impl<S: Simd> Arithmetic<S> for Bytes<'_> {
     type Right = i8;
     type Sums = S::I;
 
+    const PANELS: usize = S::BYTE_PANELS;
+
     #[inline(always)]
     fn tile_rows(self, s: S) -> usize {
         s.byte_rows()

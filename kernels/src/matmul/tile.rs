@@ -13,6 +13,9 @@ pub(crate) trait Arithmetic<S: Simd>: Copy {
     /// Sixteen sums in registers.
     type Sums: Copy;
 
+    /// Panels of the largest tile: one or two.
+    const PANELS: usize;
+
     /// Rows of the largest tile.
     fn tile_rows(self, s: S) -> usize;
 
@@ -46,6 +49,8 @@ impl<S: Simd> Arithmetic<S> for Single {
     type Left = f32;
     type Right = f32;
     type Sums = S::V;
+
+    const PANELS: usize = S::TILE.panels;
 
     #[inline(always)]
     fn tile_rows(self, _: S) -> usize {

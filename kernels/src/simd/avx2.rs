@@ -96,6 +96,7 @@ impl Simd for Avx2 {
         left.min(6)
     }
 
+    const BYTE_PANELS: usize = 1;
     #[inline(always)]
     fn byte_rows(self) -> usize {
         bytes::avx2::tile_rows(self)

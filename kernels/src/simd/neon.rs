@@ -125,6 +125,7 @@ impl Simd for Neon {
         sums
     }
 
+    const BYTE_PANELS: usize = 1;
     #[inline(always)]
     fn byte_rows(self) -> usize {
         bytes::neon::tile_rows(self)

@@ -89,6 +89,11 @@ pub trait Description: Debug + Sync {
         self.multiply_adds(site)
     }
 
+    /// How many times as long a multiply-add of this operation takes as one of a large product, about.
+    fn pace(&self) -> u64 {
+        1
+    }
+
     /// Elements that the operation reads and writes.
     fn moved(&self, site: &Site<'_>, levels: &[Level<'_>; 3]) -> usize {
         let _ = levels;

@@ -75,6 +75,11 @@ impl Description for Head {
         wide(site.rows()) * wide(channels) * wide(2 * channels + self.classes)
     }
 
+    /// Sums have few products.
+    fn pace(&self) -> u64 {
+        4
+    }
+
     fn tile(&self, _: &Site<'_>, _: Machine) -> usize {
         VOXELS
     }

@@ -18,11 +18,18 @@ use voxcast_kernels::matmul::{BLOCK_ROWS, Product, Residual, SCRATCH};
 /// Bytes of scratch of the product kernel.
 pub(super) const SCRATCH_BYTES: usize = SCRATCH * size_of::<f32>();
 
-/// Rows of a tile: as many tiles as blocks of rows, but the same number for every worker.
+/// Rows of a tile: about as many tiles as blocks of rows, cut so that the busiest worker has as few rows as can be.
 pub(super) fn rows_per_tile(site: &Site<'_>, machine: Machine) -> usize {
-    let tiles = site.rows().div_ceil(BLOCK_ROWS).next_multiple_of(machine.workers);
-    site.rows().div_ceil(tiles).next_multiple_of(machine.isa.tile().rows)
+    let (rows, workers, unit) = (site.rows(), machine.workers, machine.isa.tile().rows);
+    let fewest = rows.div_ceil(BLOCK_ROWS).next_multiple_of(workers);
+    let most = rows.div_ceil(unit).min(fewest.saturating_mul(2)).max(fewest);
+    let cuts = (fewest..=most).step_by(workers).take(CUTS).map(|tiles| rows.div_ceil(tiles).next_multiple_of(unit));
+    let busiest = |per_tile: &usize| rows.div_ceil(*per_tile).div_ceil(workers) * per_tile;
+    cuts.min_by_key(busiest).unwrap_or(unit)
 }
+
+/// Numbers of tiles that are compared.
+const CUTS: usize = 8;
 
 /// Weight and bias.
 pub(super) fn parts(geometry: &Geometry, columns: usize) -> Vec<Part> {

@@ -79,6 +79,11 @@ impl Description for WindowAttention {
         wide(plane * shape.heads * shape.key_dim) * wide(per_key)
     }
 
+    /// Windows have few keys, of few channels, and each pair of tokens an exponential.
+    fn pace(&self) -> u64 {
+        8
+    }
+
     fn tile(&self, _: &Site<'_>, _: Machine) -> usize {
         self.shape.window()[0] * self.shape.extent[1]
     }

@@ -290,9 +290,10 @@ fn regions<'a>(images: &'a mut Arena, arena: &'a mut Arena, result: &'a mut Outp
     Regions { input: images.view(), arena: arena.view(), output: result.memory_mut().view() }
 }
 
-/// Multiply-adds that take about as long as `operation`: those that it executes, or 20 for each element that it moves, by
-/// which a core computes in registers as fast as it reads memory.
+/// Multiply-adds of a large product that take about as long as `operation`: those that it executes at its own pace, or 20 for each
+/// element that it moves, by which a core computes in registers as fast as it reads memory.
 fn cost(graph: &Graph, operation: &Operation, levels: &[Level<'_>; 3]) -> u64 {
     let moved = operation.op.description().moved(&graph.site(operation), levels);
-    graph.executed_multiply_adds(operation).max(20u64.saturating_mul(moved as u64))
+    let executed = graph.executed_multiply_adds(operation).saturating_mul(operation.op.description().pace());
+    executed.max(20u64.saturating_mul(moved as u64))
 }

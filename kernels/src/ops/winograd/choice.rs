@@ -11,19 +11,19 @@ const TRANSFORM: u128 = 14;
 
 impl Shape {
     /// The shape by which a convolution to `columns` channels is computed fastest within the error of [`Shape::accurate`], or
-    /// none if a direct sum is. Its weights take at most `1 / share` of the memory of the maps ([`Shape::modest`]).
+    /// none if a direct sum is. Its weights take at most `room[0] / room[1]` times the memory of the maps ([`Shape::modest`]).
     ///
     /// Costs are counted in multiply-adds, from the shape alone: the sums, which take a quarter longer in groups and an eighth
     /// longer in a direct sum than the multiply-adds alone; both transforms, 14 per number; the weights, which are
     /// read from far away, 8 per number. Winograd must save an eighth.
-    pub fn best(geometry: &Geometry, columns: usize, share: usize) -> Option<Self> {
+    pub fn best(geometry: &Geometry, columns: usize, room: [usize; 2]) -> Option<Self> {
         let padded = columns.next_multiple_of(LANES) as u128;
         let products = geometry.depth() as u128 * padded;
         let direct = geometry.rows() as u128 * products * 9 / 8 + WEIGHT * products;
         [Scheme::Two, Scheme::Four]
             .into_iter()
             .filter_map(|scheme| Self::of(geometry, columns, scheme))
-            .filter(|shape| shape.accurate() && shape.modest(share))
+            .filter(|shape| shape.accurate() && shape.modest(room))
             .map(|shape| (shape.cost(), shape))
             .min_by_key(|(cost, _)| *cost)
             .filter(|(cost, _)| *cost <= direct / 8 * 7)
@@ -44,13 +44,13 @@ impl Shape {
         self.scheme == Scheme::Two || self.depth() >= 32
     }
 
-    /// Whether the transformed weights, of which there are up to four times as many, take at most `1 / share` of the memory
+    /// Whether the transformed weights, of which there are up to four times as many, take at most `room[0] / room[1]` times the memory
     /// of the maps that the convolution reads and writes: a network's memory follows its maps, and deep layers of small maps
     /// keep their direct sums.
-    pub fn modest(&self, share: usize) -> bool {
+    pub fn modest(&self, room: [usize; 2]) -> bool {
         let maps = self.rows() as u128 * (self.channels + self.columns) as u128;
         let per_point = self.depth() as u128 * self.columns.next_multiple_of(LANES) as u128;
-        self.scheme.points() as u128 * per_point * share as u128 <= maps
+        self.scheme.points() as u128 * per_point * room[1] as u128 <= maps * room[0] as u128
     }
 }
 
@@ -61,7 +61,7 @@ mod tests {
     fn best(input: [usize; 3], kernel: [usize; 3], channels: usize, columns: usize) -> Option<Scheme> {
         let padding = kernel.map(|k| k / 2);
         let geometry = Geometry { input, channels, kernel, stride: [1; 3], dilation: [1; 3], padding, output: input };
-        Shape::best(&geometry, columns, 1).map(|shape| shape.scheme)
+        Shape::best(&geometry, columns, [1, 1]).map(|shape| shape.scheme)
     }
 
     #[test]
@@ -93,12 +93,12 @@ mod tests {
     }
 
     #[test]
-    fn a_smaller_share_of_the_maps_leaves_smaller_tiles() {
+    fn less_room_leaves_smaller_tiles() {
         let input = [50, 50, 4];
         let (kernel, padding) = ([3; 3], [1; 3]);
         let geometry =
             Geometry { input, channels: 128, kernel, stride: [1; 3], dilation: [1; 3], padding, output: input };
-        let chosen = [1, 2, 4].map(|share| Shape::best(&geometry, 128, share).map(|shape| shape.scheme));
+        let chosen = [[1, 1], [1, 2], [1, 4]].map(|room| Shape::best(&geometry, 128, room).map(|shape| shape.scheme));
         assert_eq!(chosen, [Some(Scheme::Four), Some(Scheme::Two), None]);
     }
 
@@ -113,14 +113,14 @@ mod tests {
             padding: [0, 1, 1],
             output: [1, 58, 100],
         };
-        assert!(Shape::best(&sound, 64, 1).is_some());
+        assert!(Shape::best(&sound, 64, [1, 1]).is_some());
         for geometry in [
             Geometry { stride: [1, 2, 2], output: [1, 29, 50], ..sound },
             Geometry { dilation: [1, 2, 2], padding: [0, 2, 2], ..sound },
             Geometry { padding: [0; 3], output: [1, 56, 98], ..sound },
             Geometry { input: [2, 58, 100], output: [2, 58, 100], ..sound },
         ] {
-            assert_eq!(Shape::best(&geometry, 64, 1), None, "{geometry:?}");
+            assert_eq!(Shape::best(&geometry, 64, [1, 1]), None, "{geometry:?}");
         }
     }
 }

@@ -9,6 +9,8 @@ use core::arch::x86_64::*;
 /// Rows of a tile of two panels: sixteen sums keep two multipliers of five cycles busy. With more, the ends of the sums and
 /// the rows' addresses no longer fit into registers, which costs a quarter of the time where sums have few products.
 pub(crate) const TILE_ROWS: usize = 8;
+/// A broadcast serves two multiplications, or loads would limit the speed.
+pub(crate) const TILE_PANELS: usize = 2;
 
 #[inline(always)]
 pub(crate) fn rows<B: TileRows<Avx512>>(token: Avx512, left: usize, body: B) -> usize {

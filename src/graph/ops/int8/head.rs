@@ -70,11 +70,10 @@ impl Description for HeadI8 {
             let output = self.hidden.get(layer).map(|scale| scale.wide());
             let most = dense.weight.iter().fold(0.0f64, |most, w| most.max(w.abs()));
             let common = Steps::common(inputs[layer], most, &dense.bias);
-            let columns =
-                product::columns(&dense.weight, &dense.bias, channels, |_, weight, bias| match output {
-                    Some(output) => Steps { input: inputs[layer], output, residual: None }.column(weight, bias),
-                    None => Ok(common.column(weight, bias)),
-                })?;
+            let columns = product::columns(&dense.weight, &dense.bias, channels, |_, weight, bias| match output {
+                Some(output) => Steps { input: inputs[layer], output, residual: None }.column(weight, bias),
+                None => Ok(common.column(weight, bias)),
+            })?;
             values.extend(product::values(1, &columns, false));
             if output.is_none() {
                 values[SCALE] = vec![common.unit()];
@@ -104,6 +103,11 @@ impl Description for HeadI8 {
     fn multiply_adds(&self, site: &Site<'_>) -> u128 {
         let channels = site.input(0).channels;
         wide(site.rows()) * wide(channels) * wide(2 * channels + self.classes)
+    }
+
+    /// Sums have few products.
+    fn pace(&self) -> u64 {
+        4
     }
 
     fn tile(&self, _: &Site<'_>, _: Machine) -> usize {
