@@ -77,7 +77,7 @@ impl Case for Call {
 fn bench(name: &str, input: [usize; 3], kernel: [usize; 3], channels: usize, columns: usize) -> Bench {
     let padding = kernel.map(|taps| taps / 2);
     let geometry = Geometry { input, channels, kernel, stride: [1; 3], dilation: [1; 3], padding, output: input };
-    let shape = Shape::best(&geometry, columns, 2).expect("worth it");
+    let shape = Shape::best(&geometry, columns, [1, 2]).expect("worth it");
     let units = shape.tiles()[0];
     let each = shape.positions(&(0..1)).len();
     assert_eq!(units * each, shape.rows(), "whole tiles");
