@@ -244,7 +244,8 @@ class WindowAttention(nn.Module):
         side = self.side
         if height <= side and width <= side:
             return self.attn(x)
-        rows, columns = -(-height // side), -(-width // side)
+        # Not by negative numbers: ONNX's division of integers rounds towards zero.
+        rows, columns = (height + side - 1) // side, (width + side - 1) // side
         x = F.pad(x, (0, columns * side - width, 0, rows * side - height))
         x = x.reshape(batch, channels, rows, side, columns, side).permute(0, 2, 4, 1, 3, 5)
         x = self.attn(x.reshape(-1, channels, side, side)).reshape(batch, rows, columns, channels, side, side)
