@@ -21,7 +21,7 @@ import tempfile
 import time
 from pathlib import Path
 
-THREADS, REPEAT = 2, 5
+THREADS, REPEAT = 2, 3
 HALVES = {"image": "image half, one camera", "volume": "everything after the gather"}
 NETWORK = {
     "depths": [3, 4, 23, 3],
