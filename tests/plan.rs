@@ -124,7 +124,7 @@ proptest! {
         workers in 1usize..4,
     ) {
         network.check().unwrap();
-        let graph = Graph::build(&network, Results { logits: coarse, coarse_heads: coarse }).rewritten(rewrites);
+        let graph = Graph::build(&network, Results { logits: coarse, coarse_heads: coarse, ..Results::default() }).rewritten(rewrites);
         let plan = Plan::new(&graph, network.cameras, workers).unwrap();
         let mut blocks: Vec<(Option<TensorId>, Place, Range<usize>)> = (0..workers)
             .map(|w| (None, Place { region: Region::Arena, bytes: plan.scratch(w) }, 0..graph.operations.len()))
