@@ -37,12 +37,13 @@ fn memory_is_what_was_told() {
     let model = small::model(&network, Precision::F32, Rewrites::ALL, 1);
     let rig = small::rig(&network, 0.3);
     for threads in [1, 3] {
-        for flags in 0..8 {
+        for flags in 0..16 {
             let options = SessionOptions {
                 threads: Threads::new(threads).unwrap(),
                 unfolded: flags & 1 != 0,
                 logits: flags & 2 != 0,
                 coarse_heads: flags & 4 != 0,
+                confidence: flags & 8 != 0,
                 ..SessionOptions::default()
             };
             let told = Session::memory(&model, network.cameras, &options).unwrap();

@@ -7,6 +7,7 @@
 
 use super::losses::Losses;
 use super::ray_iou::RayCounts;
+use super::reliability::{CODES, Calibration, Reliability};
 use super::subject::{Shard, Subject};
 use super::{Confusion, FrameScore, Kind, LossSum, Score};
 use crate::base::error::{Error, ErrorKind, Result};
@@ -23,7 +24,7 @@ const MAX_COUNT: u64 = 1 << 40;
 
 /// What the first line calls the file, and the layout of the lines.
 const FORMAT: &str = "evaluation";
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 
 /// An open journal. No other process can open it meanwhile.
 #[derive(Debug)]
@@ -69,6 +70,8 @@ struct LineScore {
     rays: [Vec<u64>; 5],
     /// Frames; then the bits of focal, Lovasz, geometric and semantic sums, because decimals may lose the last one.
     losses: [u64; 5],
+    /// For each region, of "occupied" and of the class: place and number of the counts by code and outcome.
+    calibration: Vec<[Vec<u64>; 2]>,
 }
 
 /// A frame's score with its place in the set.
@@ -329,6 +332,7 @@ impl LineScore {
             published: sparse(&score.published),
             rays: [labelled, predicted, one, two, four].map(Vec::clone),
             losses: [score.losses.frames, focal, lovasz, geometric, semantic],
+            calibration: score.calibration.iter().map(|c| [&c.occupied, &c.class].map(sparse_codes)).collect(),
         }
     }
 
@@ -349,29 +353,54 @@ impl LineScore {
         let [frames, losses @ ..] = self.losses;
         let [focal, lovasz, geometric, semantic] = losses.map(f64::from_bits);
         let published = dense(kind.classes + 1, &self.published)?;
+        let calibration = |[occupied, class]: &[Vec<u64>; 2]| {
+            Some(Calibration { occupied: dense_codes(occupied)?, class: dense_codes(class)? })
+        };
+        let calibration = self.calibration.iter().map(calibration).collect::<Option<Vec<_>>>()?;
+        let right = right && calibration.len() == kind.regions;
         right.then_some(Score {
             regions,
             published,
             rays: RayCounts { labelled, predicted, hits: [one, two, four] },
             losses: LossSum { frames, sum: Losses { focal, lovasz, geometric, semantic } },
+            calibration,
         })
     }
 }
 
 /// Place and number of the counts that are not 0.
-fn sparse(confusion: &Confusion) -> Vec<u64> {
-    let counts = (0u64..).zip(confusion.counts()).filter(|&(_, &count)| count > 0);
+fn pairs(counts: &[u64]) -> Vec<u64> {
+    let counts = (0u64..).zip(counts).filter(|&(_, &count)| count > 0);
     counts.flat_map(|(place, &count)| [place, count]).collect()
 }
 
-/// The counts again; none if a place is beyond the matrix or a number beyond what frames have.
-fn dense(classes: usize, pairs: &[u64]) -> Option<Confusion> {
-    let mut counts = vec![0; classes * classes];
+/// Fills in counts from [`pairs`]; none if a place is beyond them or a number beyond what frames have.
+fn fill(counts: &mut [u64], pairs: &[u64]) -> Option<()> {
     for pair in pairs.chunks(2) {
         let &[place, count] = pair else { return None };
         *counts.get_mut(usize::try_from(place).ok()?)? = Some(count).filter(|&count| count <= MAX_COUNT)?;
     }
+    Some(())
+}
+
+fn sparse(confusion: &Confusion) -> Vec<u64> {
+    pairs(confusion.counts())
+}
+
+fn dense(classes: usize, pairs: &[u64]) -> Option<Confusion> {
+    let mut counts = vec![0; classes * classes];
+    fill(&mut counts, pairs)?;
     Confusion::from_counts(classes, counts)
+}
+
+fn sparse_codes(reliability: &Reliability) -> Vec<u64> {
+    pairs(reliability.counts().as_flattened())
+}
+
+fn dense_codes(pairs: &[u64]) -> Option<Reliability> {
+    let mut counts = vec![[0; 2]; CODES];
+    fill(counts.as_flattened_mut(), pairs)?;
+    Reliability::from_counts(counts)
 }
 
 #[cfg(test)]
@@ -393,6 +422,7 @@ mod tests {
             classes: ["empty", "a", "b"].map(str::to_owned).to_vec(),
             masks: vec![],
             losses: true,
+            calibration: true,
             rings: vec![20.0],
             version: "1".to_owned(),
         }
@@ -409,6 +439,7 @@ mod tests {
             (score.rays.labelled[1], score.rays.predicted[1]) = (9, 12);
             score.published.add(3, seed % 3);
             score.rays.hits[2][1] = u64::from(seed);
+            score.calibration[1].add([seed, 255], seed % 3, 1);
             let value = f64::from(seed) / 3.0;
             score.losses.add(&Losses { focal: value, lovasz: value.exp(), geometric: 1e-300, semantic: -0.0 });
         }

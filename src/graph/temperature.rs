@@ -68,7 +68,7 @@ mod tests {
     fn temperatures_are_positive_normal_numbers() {
         let temperature: Temperature = "1.6".parse().expect("a temperature");
         assert_eq!((temperature.value(), temperature.inverse()), (1.6, 0.625));
-        assert_eq!(temperature.to_string().parse::<Temperature>(), Ok(temperature));
+        assert_eq!(temperature.to_string().parse::<Temperature>().expect("its own text"), temperature);
         assert_eq!((Temperature::default(), Temperature::ONE.to_string().as_str()), (Temperature::ONE, "1"));
         for text in ["", "warm", "0", "-1", "nan", "inf", "1e-40", "1e39", "3e38"] {
             let error = text.parse::<Temperature>().expect_err(text);
