@@ -66,7 +66,8 @@ fn kubernetes(variable: &dyn Fn(&str) -> Option<String>) -> Result<Shard> {
 }
 
 fn number(name: &str, variable: &dyn Fn(&str) -> Option<String>) -> Result<usize> {
-    let found = variable(name).ok_or_else(|| Error::mismatch(format!("--shard auto: {name} is not set, expected a number")))?;
+    let found =
+        variable(name).ok_or_else(|| Error::mismatch(format!("--shard auto: {name} is not set, expected a number")))?;
     let message = || Error::mismatch(format!("--shard auto: {name} is {found:?}, expected a number"));
     found.parse().map_err(|_| message())
 }

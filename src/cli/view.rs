@@ -13,7 +13,8 @@ use voxcast::{Error, Network, Result, Scene};
 /// Make a page of a result, to look at in a browser.
 ///
 /// The page is one file that needs nothing else and asks no network for anything: voxels to turn and to slice, classes to
-/// switch, what no camera sees, how likely a voxel must be to be shown (of a result of `run --confidence`), truth and difference, camera images with the voxels on them.
+/// switch, what no camera sees, how likely a voxel must be to be shown (of a result of `run --confidence`), truth and
+/// difference, camera images with the voxels on them.
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Examples:
