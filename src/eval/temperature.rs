@@ -7,7 +7,7 @@
 //! sum over voxels of  (sum over k of p[k] logits[k]) - logits[label],   p = softmax(b logits)
 //! ```
 //!
-//! whose zero Newton's method finds, within a bracket. Every step runs the network on all frames once more, so that no logits
+//! whose zero Newton's method finds, within a bracket, and bisection where that does not arrive. Every step runs the network on all frames once more, so that no logits
 //! are kept. Sums are taken in a fixed order and exp is the kernels' own: the same set gives the same temperature on every
 //! machine and number of threads.
 
@@ -30,7 +30,10 @@ const MOST: f64 = 100.0;
 /// Newton's method has arrived when it moves less than this share.
 const CLOSE: f64 = 1e-4;
 
-/// Passes over the set: bisection alone would take this many.
+/// Steps of Newton's method, after which the bracket is bisected: towards labels that no temperature fits it walks without end.
+const STEPS: usize = 8;
+
+/// Passes over the set, which bisection does not need.
 const PASSES: usize = 32;
 
 /// What a fit came to.
@@ -85,9 +88,14 @@ impl Slope {
 struct Search {
     inverse: f64,
     bracket: [f64; 2],
+    steps: usize,
 }
 
 impl Search {
+    fn new() -> Self {
+        Self { inverse: 1.0, bracket: [LEAST, MOST], steps: 0 }
+    }
+
     /// Moves to where the slope seems to be zero. True when that is close to where it was.
     ///
     /// # Errors
@@ -100,11 +108,13 @@ impl Search {
         self.bracket[usize::from(slope.first > 0.0)] = at;
         let [low, high] = self.bracket;
         let newton = at - slope.first / slope.second;
-        self.inverse = if newton > low && newton < high { newton } else { (low * high).sqrt() };
+        let newton = Some(newton).filter(|newton| self.steps < STEPS && *newton > low && *newton < high);
+        self.steps += 1;
+        self.inverse = newton.unwrap_or((low * high).sqrt());
         if slope.first == 0.0 {
             self.inverse = at;
         }
-        if self.inverse < LEAST * (1.0 + CLOSE) || self.inverse > MOST * (1.0 - CLOSE) {
+        if self.inverse < LEAST * (1.0 + 2.0 * CLOSE) || self.inverse > MOST * (1.0 - 2.0 * CLOSE) {
             let message = format!("no temperature from {} to {} fits the labels", 1.0 / MOST, 1.0 / LEAST);
             return Err(Error::mismatch(message));
         }
@@ -134,7 +144,7 @@ pub fn fit_temperature(
     let options = SessionOptions { logits: true, ..options.clone() };
     let frames = limit.map_or(set.len(), |limit| set.len().min(limit));
     let mut running: Option<Moving> = None;
-    let mut search = Search { inverse: 1.0, bracket: [LEAST, MOST] };
+    let mut search = Search::new();
     for pass in 0..PASSES {
         let mut sum = Slope::default();
         for index in 0..frames {
@@ -198,7 +208,7 @@ mod tests {
 
     /// The zero of the slope of these voxels.
     fn fitted(voxels: &[(Vec<f32>, u8)]) -> Result<f64> {
-        let mut search = Search { inverse: 1.0, bracket: [LEAST, MOST] };
+        let mut search = Search::new();
         for _ in 0..PASSES {
             let mut sum = Slope::default();
             voxels.iter().for_each(|(logits, label)| sum.see(logits, *label, search.inverse as f32));

@@ -109,10 +109,12 @@ fn what_does_not_belong_is_refused_and_left_alone() {
         ("[5,1]", "[5,1099511627777]", "line 2: counts"),
         ("[0,9,0]", "[0,0,0]", "line 2: counts"),
         ("fffffffe\"]", "fffffffe\",\"0\"]", "line 2: counts"),
+        ("[511,1]", "[512,1]", "line 2: counts"),
+        ("\"calibration\":[[", "\"calibration\":[[[],[]],[", "line 2: counts"),
         ("\"losses\":[", "\"loses\":[", "line 2: "),
         ("\"index\":1", "\"index\":2", "line 2: frame 2 is not of shard 1/2"),
         ("\"index\":1", "\"index\":9", "line 2: frame 9, expected one of 9"),
-        ("\"version\":2", "\"version\":1", "of version 1, expected"),
+        ("\"version\":3", "\"version\":1", "of version 1, expected"),
         ("[\"a name\"]", "[]", "line 1: 0 names"),
         ("\"shard\":[1,2]", "\"shard\":[2,2]", "line 1: shard 2/2"),
     ] {
