@@ -84,7 +84,7 @@
  * Files       that are mapped (models and rigs) must not be changed while they are. Replacing one by renaming another
  *             over it is fine. docs/security.md tells what is checked and what cannot be.
  *
- * Bits.       The same model file, matrices and images give the same classes and logits, on every machine, whatever the
+ * Bits.       The same model file, matrices and images give the same classes, logits and confidence, on every machine, whatever the
  *             options and the order and slicing of calls. docs/determinism.md has the terms. The floating-point
  *             environment must be the default one: round to nearest, no flush to zero.
  *
@@ -127,7 +127,7 @@ enum {
     VOXCAST_FORMAT = 4,
     /* Sound input that does not belong here: a rig of another network, an image of another size, a camera too many. */
     VOXCAST_MISMATCH = 5,
-    /* Understood, and not available: an instruction set of another CPU, logits that the session does not keep. */
+    /* Understood, and not available: an instruction set of another CPU, logits or a confidence that the session does not keep. */
     VOXCAST_UNSUPPORTED = 6,
     /* More memory than there is, or than the formats can address. */
     VOXCAST_TOO_LARGE = 7,
@@ -239,6 +239,10 @@ typedef struct voxcast_options {
      * slice is at least one tile of an operation for every thread. Ignored by rig builders.
      */
     uint64_t slice_cost;
+    /* 1 to keep how sure the network is of every voxel. Ignored by rig builders. */
+    uint32_t confidence;
+    /* 0. */
+    uint32_t reserved;
 } voxcast_options;
 
 /*
@@ -493,6 +497,21 @@ voxcast_status voxcast_session_classes(
  */
 voxcast_status voxcast_session_logits(
     voxcast_session *session, float *logits, size_t room, size_t *length, char *message, size_t capacity);
+
+/*
+ * The probability that each voxel is occupied, that is of any class but 0: 0 to 255 for 0 to 1. The length is `voxels`.
+ *
+ * It is a softmax of the logits, divided by the temperature that the model carries. How far it can be trusted is what
+ * `voxcast eval --calibration` measures. Where a logit is no number, it is 0.
+ *
+ * Fails    VOXCAST_UNSUPPORTED if the session's options did not ask for the confidence.
+ */
+voxcast_status voxcast_session_confidence_occupied(
+    voxcast_session *session, uint8_t *codes, size_t room, size_t *length, char *message, size_t capacity);
+
+/* As above, the probability of each voxel's class, which may be 0. */
+voxcast_status voxcast_session_confidence_class(
+    voxcast_session *session, uint8_t *codes, size_t room, size_t *length, char *message, size_t capacity);
 
 /*
  * By how many feature pixels each voxel is seen, masked cameras left out, at most 65535. Where it is 0 no camera sees

@@ -155,7 +155,7 @@ pub use network::Network;
 pub use note::Note;
 pub use rig::Rig;
 pub use scene::Scene;
-pub use session::{Budget, Occupancy, Session, SessionOptions, Step};
+pub use session::{Budget, Confidence, Occupancy, Session, SessionOptions, Step};
 pub use threads::Threads;
 pub use voxcast_kernels::{Isa, IsaError};
 

@@ -97,6 +97,7 @@ fn everything_is_allocated_when_a_session_is_made_and_known_before() {
                 isa: Isa::best(),
                 threads: Threads::new(threads).unwrap(),
                 logits: threads != 2,
+                confidence: threads != 1,
                 coarse_heads: threads == 3,
                 slice_cost: 1000,
                 ..SessionOptions::default()

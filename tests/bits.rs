@@ -9,26 +9,29 @@ use small::Images;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use voxcast::container::{self, Container, Data, Layout, Tensor};
-use voxcast::graph::{Graph, Op, Results, Rewrites};
+use voxcast::graph::{Graph, Op, Results, Rewrites, Temperature};
 use voxcast::weights::Precision;
-use voxcast::{ImageView, Isa, Model, Network, Rig, Session, SessionOptions, Threads};
+use voxcast::{Confidence, ImageView, Isa, Model, Network, Rig, Session, SessionOptions, Threads};
 
 /// Everything that a frame gives, in bits.
 #[derive(Debug, PartialEq)]
 struct Bits {
     classes: Vec<u8>,
     logits: Vec<u32>,
+    /// Of "occupied" and of the class.
+    confidence: [Vec<u8>; 2],
 }
 
 fn session(model: &Arc<Model>, rig: &Arc<Rig>, isa: Isa, threads: Threads) -> Session {
-    let options = SessionOptions { isa, threads, logits: true, ..SessionOptions::default() };
+    let options = SessionOptions { isa, threads, logits: true, confidence: true, ..SessionOptions::default() };
     Session::new(model.clone(), rig.clone(), &options).unwrap()
 }
 
 fn run(session: &mut Session, images: &[ImageView<'_>]) -> Bits {
     let result = session.run(images).unwrap();
     let logits = result.logits.expect("asked for").iter().map(|v| v.to_bits()).collect();
-    Bits { classes: result.classes.to_vec(), logits }
+    let Confidence { occupied, class } = result.confidence.expect("asked for");
+    Bits { classes: result.classes.to_vec(), logits, confidence: [occupied.to_vec(), class.to_vec()] }
 }
 
 /// Names where two results part; whole vectors in a message would fill screens.
@@ -37,6 +40,7 @@ fn assert_same(found: &Bits, expected: &Bits, what: &str) {
     assert_eq!(first, None, "{what}: the first logit that differs");
     let first = found.classes.iter().zip(&expected.classes).position(|(a, b)| a != b);
     assert_eq!(first, None, "{what}: the first class that differs");
+    assert!(found.confidence == expected.confidence, "{what}: how sure it is differs");
     assert_eq!((found.logits.len(), found.classes.len()), (expected.logits.len(), expected.classes.len()), "{what}");
 }
 
@@ -154,8 +158,47 @@ fn coarse_heads_and_observers_do_not_show() {
     let mut seen = 0;
     let result = other.run_observed(&images.views(), &mut |_| seen += 1).unwrap();
     assert_eq!(result.classes, expected.classes);
-    assert_eq!(result.logits, None, "nobody asked for them");
+    assert_eq!((result.logits, result.confidence), (None, None), "nobody asked for them");
     assert!(seen > 100, "{seen} events");
+}
+
+/// The confidence is the softmax of the logits over the model's temperature, whatever the precision, and asking for it changes
+/// nothing else.
+#[test]
+fn confidence_is_a_softmax_of_the_logits() {
+    for (precision, temperature) in [(Precision::F32, 1.0), (Precision::F16, 3.0), (Precision::I8, 0.4)] {
+        let network = small::suited(small::network(), precision);
+        let (rig, images) = (small::rig(&network, 0.3), Images::new(&network, 5));
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("model");
+        let model = small::model(&network, precision, Rewrites::ALL, 1);
+        model.save_with_temperature(Temperature::try_from(temperature).unwrap(), &path).unwrap();
+        let sharp = Arc::new(Model::open(&path).unwrap());
+        assert_eq!((model.temperature().value(), sharp.temperature().value()), (1.0, temperature));
+        let plain = run(&mut session(&model, &rig, Isa::best(), Threads::calling()), &images.views());
+        let found = run(&mut session(&sharp, &rig, Isa::best(), Threads::new(3).unwrap()), &images.views());
+        assert!(found.classes == plain.classes && found.logits == plain.logits, "a temperature changes neither");
+        assert_eq!(temperature == 1.0, found.confidence == plain.confidence);
+        // Nothing else is asked for: the same codes.
+        let options = SessionOptions { confidence: true, ..SessionOptions::default() };
+        let mut alone = Session::new(sharp, rig, &options).unwrap();
+        let result = alone.run(&images.views()).unwrap();
+        let Confidence { occupied, class } = result.confidence.unwrap();
+        assert!(result.logits.is_none() && result.classes == plain.classes);
+        assert!([occupied, class] == found.confidence.each_ref().map(|codes| &codes[..]));
+        let mut seen = std::collections::BTreeSet::new();
+        for (voxel, logits) in found.logits.chunks_exact(network.classes).enumerate() {
+            let scaled: Vec<f64> = logits.iter().map(|&bits| f64::from(f32::from_bits(bits) / temperature)).collect();
+            let most = scaled.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+            let total: f64 = scaled.iter().map(|logit| (logit - most).exp()).sum();
+            let exact = [1.0 - (scaled[0] - most).exp() / total, 1.0 / total].map(|p| 255.0 * p);
+            let codes = [occupied[voxel], class[voxel]];
+            let off = codes.iter().zip(exact).map(|(&code, exact)| (f64::from(code) - exact).abs());
+            assert!(off.fold(0.0, f64::max) < 0.51, "{precision:?} voxel {voxel}: {codes:?}, not {exact:?}");
+            seen.extend(codes);
+        }
+        assert!(seen.len() > 50, "{precision:?}: {} codes", seen.len());
+    }
 }
 
 /// Half precision is storage: a model of the same numbers in single precision gives the same bits.

@@ -13,7 +13,7 @@ use voxcast_kernels::deform_conv2d::{DeformConv2d, deform_conv2d};
 use voxcast_kernels::depthwise::{Depthwise, depthwise};
 use voxcast_kernels::gate::{Gate, gate};
 use voxcast_kernels::gather::{Gather, gather};
-use voxcast_kernels::head::{Head, head};
+use voxcast_kernels::head::{Head, Results, head};
 use voxcast_kernels::max_pool::{MaxPool, max_pool};
 use voxcast_kernels::normalise::normalise;
 use voxcast_kernels::panels::{pack, packed_len};
@@ -344,7 +344,8 @@ impl Run<'_> {
         };
         let (mut found, mut logits) = (vec![0; voxels], vec![f32::NAN; voxels * classes]);
         let mut scratch = vec![f32::NAN; voxcast_kernels::head::scratch_len(channels, classes)];
-        head(self.isa, &args, 0..voxels, &mut found, Some(&mut logits), &mut scratch);
+        let results = Results { classes: &mut found, logits: Some(&mut logits), confidence: None };
+        head(self.isa, &args, 0..voxels, results, &mut scratch);
         logits
     }
 }

@@ -17,6 +17,7 @@ use voxcast_kernels::dequantise::dequantise;
 use voxcast_kernels::gate_i8::{self, GateI8, gate_i8};
 use voxcast_kernels::gather::Gather;
 use voxcast_kernels::gather_i8::{self, gather_i8};
+use voxcast_kernels::head::Results;
 use voxcast_kernels::head_i8::{HeadI8, LayerI8, head_i8};
 use voxcast_kernels::max_pool::MaxPool;
 use voxcast_kernels::max_pool_i8::max_pool_i8;
@@ -299,7 +300,8 @@ impl Run<'_> {
         };
         let (mut found, mut logits) = (vec![0; voxels], vec![f32::NAN; voxels * classes]);
         let mut scratch = vec![JUNK.into(); voxcast_kernels::head_i8::scratch_len(channels, classes)];
-        head_i8(self.isa, &args, 0..voxels, &mut found, Some(&mut logits), &mut scratch);
+        let results = Results { classes: &mut found, logits: Some(&mut logits), confidence: None };
+        head_i8(self.isa, &args, 0..voxels, results, &mut scratch);
         logits.iter().map(|&logit| logit as i32).chain(found.into_iter().map(i32::from)).collect()
     }
 

@@ -37,12 +37,13 @@ fn memory_is_what_was_told() {
     let model = small::model(&network, Precision::F32, Rewrites::ALL, 1);
     let rig = small::rig(&network, 0.3);
     for threads in [1, 3] {
-        for flags in 0..8 {
+        for flags in 0..16 {
             let options = SessionOptions {
                 threads: Threads::new(threads).unwrap(),
                 unfolded: flags & 1 != 0,
                 logits: flags & 2 != 0,
                 coarse_heads: flags & 4 != 0,
+                confidence: flags & 8 != 0,
                 ..SessionOptions::default()
             };
             let told = Session::memory(&model, network.cameras, &options).unwrap();
@@ -124,7 +125,7 @@ proptest! {
         workers in 1usize..4,
     ) {
         network.check().unwrap();
-        let graph = Graph::build(&network, Results { logits: coarse, coarse_heads: coarse }).rewritten(rewrites);
+        let graph = Graph::build(&network, Results { logits: coarse, coarse_heads: coarse, ..Results::default() }).rewritten(rewrites);
         let plan = Plan::new(&graph, network.cameras, workers).unwrap();
         let mut blocks: Vec<(Option<TensorId>, Place, Range<usize>)> = (0..workers)
             .map(|w| (None, Place { region: Region::Arena, bytes: plan.scratch(w) }, 0..graph.operations.len()))

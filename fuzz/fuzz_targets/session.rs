@@ -197,8 +197,13 @@ impl Bench {
     /// The session's result is a whole frame of a fresh session of the scalar code.
     fn check(&self, session: &Session, told: &Told) {
         let found = session.occupancy().expect("a result");
-        let options =
-            SessionOptions { isa: Isa::Scalar, unfolded: self.unfolded, logits: true, ..SessionOptions::default() };
+        let options = SessionOptions {
+            isa: Isa::Scalar,
+            unfolded: self.unfolded,
+            logits: true,
+            confidence: true,
+            ..SessionOptions::default()
+        };
         let mut fresh =
             Session::new(self.model.clone(), self.rigs[told.rig].clone(), &options).expect("a small session");
         let images: Vec<ImageView<'_>> = (0..told.given.len())
@@ -216,6 +221,9 @@ impl Bench {
         if let Some(logits) = found.logits {
             let difference = Output::from(logits).difference(&Output::from(expected.logits.expect("asked for")));
             assert_eq!(difference, None, "logits");
+        }
+        if found.confidence.is_some() {
+            assert_eq!(found.confidence, expected.confidence);
         }
     }
 }
@@ -241,6 +249,7 @@ fn options(input: &mut Draw, unfolded: bool) -> SessionOptions {
         logits: !input.byte().is_multiple_of(4),
         coarse_heads: input.flag(),
         slice_cost: [0, 1, 500, 50_000, u64::MAX][input.extent(0, 4)],
+        confidence: input.flag(),
     }
 }
 

@@ -10,11 +10,11 @@ use std::sync::{Arc, Mutex};
 use voxcast::dataset::Named;
 use voxcast::eval::{self, Journal, Means, Predictor, Scope, Shard, Summary, Totals, write_text};
 use voxcast::note::Said;
-use voxcast::{Error, ErrorKind};
+use voxcast::{Error, ErrorKind, SessionOptions};
 
 /// One model, or two that are compared, on a data set with labels.
 ///
-/// Evaluation(models, data, *, losses=False, limit=None, shard=None, resume=None)
+/// Evaluation(models, data, *, losses=False, calibration=False, limit=None, shard=None, resume=None)
 ///
 /// models: one or two. data: a set as on the command line, such as "synthetic:heldout". shard: "I/N", of which frames I,
 /// I + N, ... are this one's. resume: the journal that keeps every frame's score.
@@ -32,12 +32,14 @@ struct State {
 #[pymethods]
 impl Evaluation {
     #[new]
-    #[pyo3(signature = (models, data, *, losses = false, limit = None, shard = None, resume = None))]
+    #[allow(clippy::too_many_arguments, reason = "Python's keyword arguments")]
+    #[pyo3(signature = (models, data, *, losses = false, calibration = false, limit = None, shard = None, resume = None))]
     fn new(
         py: Python<'_>,
         models: Vec<Py<Model>>,
         data: &str,
         losses: bool,
+        calibration: bool,
         limit: Option<usize>,
         shard: Option<&str>,
         resume: Option<PathBuf>,
@@ -48,7 +50,7 @@ impl Evaluation {
         }
         let named: Named = data.parse().map_err(|e| PyValueError::new_err(format!("data {data:?}: {e}")))?;
         let shard = shard.map_or(Ok(Shard::WHOLE), str::parse)?;
-        let scope = Scope { losses, limit, shard, ..Scope::default() };
+        let scope = Scope { losses, calibration, limit, shard, ..Scope::default() };
         let predictors = models.iter().map(|model| Predictor::model(model.get().model.clone())).collect();
         py.detach(|| {
             let evaluation = eval::Evaluation::new(named.open()?, data, predictors, &scope)?;
@@ -203,6 +205,12 @@ impl Report {
         Ok(self.summary.write_confusion(&path)?)
     }
 
+    /// Draws the reliability diagram as a PNG: of "occupied" and of the class, or of two models of "occupied". Of an evaluation
+    /// with calibration=True.
+    fn write_reliability(&self, path: PathBuf) -> Outcome {
+        Ok(self.summary.write_reliability(&path)?)
+    }
+
     fn __str__(&self) -> String {
         self.summary.text()
     }
@@ -215,6 +223,45 @@ impl Report {
     /// For notebooks: the tables.
     fn _repr_markdown_(&self) -> String {
         self.summary.markdown()
+    }
+}
+
+/// Fits the temperature of a model's probabilities to a set with labels, which training has not seen, and writes the model with
+/// it to `output`, which may be its own file. Classes and logits stay as they are. Returns the model that was written.
+///
+/// data: as for evaluate. limit: only the first frames. Every frame is run some five times. isa: as for Session.
+#[pyfunction]
+#[pyo3(signature = (model, data, output, *, limit = None, threads = None, isa = None))]
+pub(crate) fn calibrate_confidence(
+    py: Python<'_>,
+    model: &Model,
+    data: &str,
+    output: PathBuf,
+    limit: Option<usize>,
+    threads: Option<usize>,
+    isa: Option<&str>,
+) -> Outcome<Model> {
+    let named: Named = data.parse().map_err(|e| PyValueError::new_err(format!("data {data:?}: {e}")))?;
+    let (threads, isa) = (machine::threads(threads)?, machine::isa(isa)?);
+    let options = SessionOptions { isa, threads, ..SessionOptions::default() };
+    let (mut raised, mut said) = (None, Said::default());
+    let done = py.detach(|| -> voxcast::Result<voxcast::Model> {
+        let set = named.open()?;
+        let fit = eval::fit_temperature(&model.model, &*set, data, limit, &options, &mut |_, notes| {
+            Python::attach(|py| {
+                let warned = warn(py, &said.fresh(notes.to_vec()), 1);
+                py.check_signals().and(warned).map_err(|error| {
+                    raised = Some(error);
+                    Error::new(ErrorKind::Unsupported, "the fit was interrupted")
+                })
+            })
+        })?;
+        model.model.save_with_temperature(fit.temperature, &output)?;
+        voxcast::Model::open(&output)
+    });
+    match raised {
+        Some(error) => Err(Failure::Python(error)),
+        None => Ok(Model::of(done?)),
     }
 }
 

@@ -29,7 +29,7 @@ use pyo3::prelude::*;
 #[pymodule]
 mod _native {
     #[pymodule_export]
-    use crate::evaluation::{Evaluation, Report, Worker, merge};
+    use crate::evaluation::{Evaluation, Report, Worker, calibrate_confidence, merge};
     #[pymodule_export]
     use crate::model::{Model, import_file, import_tensors, network_json};
     #[pymodule_export]

@@ -28,7 +28,7 @@ pub(crate) struct Model {
 }
 
 impl Model {
-    fn of(model: voxcast::Model) -> Self {
+    pub(crate) fn of(model: voxcast::Model) -> Self {
         Self { model: Arc::new(model) }
     }
 }
@@ -109,6 +109,12 @@ impl Model {
     #[getter]
     fn precision(&self) -> &'static str {
         self.model.options().precision.name()
+    }
+
+    /// What logits are divided by before their softmax says how sure the network is; 1 unless `calibrate_confidence` has fitted it.
+    #[getter]
+    fn temperature(&self) -> f32 {
+        self.model.temperature().value()
     }
 
     /// The file's checksum, as `voxcast inspect` prints it; None for a file that has none.

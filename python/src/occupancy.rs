@@ -49,6 +49,17 @@ impl Occupancy {
         &self.model
     }
 
+    /// One of the two probabilities, if there are any.
+    fn confidence<'py>(
+        slf: &Bound<'py, Self>,
+        of: impl for<'a> Fn(voxcast::Confidence<'a>) -> &'a [u8],
+    ) -> Outcome<Option<Bound<'py, PyArray3<u8>>>> {
+        let view = slf.get().view();
+        let Some(confidence) = view.confidence else { return Ok(None) };
+        // SAFETY: the class is frozen; only dropping it gives its memory away.
+        Ok(Some(unsafe { lend::<_, Ix3>(of(confidence), view.grid.size, slf.as_any()) }?))
+    }
+
     pub(crate) fn view(&self) -> voxcast::Occupancy<'_> {
         match &self.owned {
             Some(owned) => owned.view(),
@@ -94,6 +105,20 @@ impl Occupancy {
         let shape = (x, y, z, this.model.network().classes);
         // SAFETY: as for the classes.
         Ok(Some(unsafe { lend::<_, Ix4>(logits, shape, slf.as_any()) }?))
+    }
+
+    /// uint8 [X, Y, Z], the probability that each voxel is occupied, 0 to 255 for 0 to 1; None unless the session was made with
+    /// confidence=True.
+    #[getter]
+    fn confidence_occupied<'py>(slf: &Bound<'py, Self>) -> Outcome<Option<Bound<'py, PyArray3<u8>>>> {
+        Self::confidence(slf, |confidence| confidence.occupied)
+    }
+
+    /// uint8 [X, Y, Z], the probability of each voxel's class, 0 to 255 for 0 to 1; None unless the session was made with
+    /// confidence=True.
+    #[getter]
+    fn confidence_class<'py>(slf: &Bound<'py, Self>) -> Outcome<Option<Bound<'py, PyArray3<u8>>>> {
+        Self::confidence(slf, |confidence| confidence.class)
     }
 
     /// XXH3-64 of the classes, as `voxcast run` prints it: the same on every machine.

@@ -49,8 +49,11 @@ pub(crate) fn view(
     let scene = scene.map(|scene| &scene.get().scene);
     let html = py.detach(|| -> voxcast::Result<String> {
         let grid = result.grid;
-        let prediction =
+        let mut prediction =
             picture::Occupancy::new("", result.classes, grid, grid.forward())?.with_support(result.support)?;
+        if let Some(confidence) = result.confidence {
+            prediction = prediction.with_confidence(confidence.occupied)?;
+        }
         let palette = Palette::of(network.classes);
         let truth = truth.as_deref();
         voxcast::html::Page { title, subtitle, prediction, truth, scene, palette: &palette }.to_html()

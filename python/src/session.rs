@@ -15,10 +15,10 @@ use voxcast::{Budget, SessionOptions, Step};
 /// A model with memory to run in. Frames allocate nothing but their results, and these use the memory of results that
 /// nobody holds any more.
 ///
-/// Session(model, rig, *, threads=None, logits=False, isa=None)
+/// Session(model, rig, *, threads=None, logits=False, confidence=False, isa=None)
 ///
-/// threads: as many as there are CPUs by default. logits: whether results have them. isa: "scalar", "avx2" or "avx512";
-/// the fastest of this CPU by default. None of these changes a bit of a result.
+/// threads: as many as there are CPUs by default. logits: whether results have them. confidence: whether results say how
+/// sure the network is. isa: "scalar", "avx2" or "avx512"; the fastest of this CPU by default. None of these changes a bit of a result.
 ///
 /// The interpreter's lock is free while a frame runs: sessions in several Python threads run side by side. One session
 /// serves one thread at a time, and raises BusyError in another.
@@ -37,24 +37,25 @@ struct Inner {
     last: Option<Py<Occupancy>>,
 }
 
-fn options(threads: Option<usize>, logits: bool, isa: Option<&str>) -> Outcome<SessionOptions> {
+fn options(threads: Option<usize>, logits: bool, confidence: bool, isa: Option<&str>) -> Outcome<SessionOptions> {
     let (threads, isa) = (machine::threads(threads)?, machine::isa(isa)?);
-    Ok(SessionOptions { isa, threads, logits, ..SessionOptions::default() })
+    Ok(SessionOptions { isa, threads, logits, confidence, ..SessionOptions::default() })
 }
 
 #[pymethods]
 impl Session {
     #[new]
-    #[pyo3(signature = (model, rig, *, threads = None, logits = false, isa = None))]
+    #[pyo3(signature = (model, rig, *, threads = None, logits = false, confidence = false, isa = None))]
     fn new(
         py: Python<'_>,
         model: &Model,
         rig: &Rig,
         threads: Option<usize>,
         logits: bool,
+        confidence: bool,
         isa: Option<&str>,
     ) -> Outcome<Self> {
-        let options = options(threads, logits, isa)?;
+        let options = options(threads, logits, confidence, isa)?;
         let (model, rig) = (model.model.clone(), rig.rig.clone());
         let session = py.detach(|| voxcast::Session::new(model.clone(), rig, &options))?;
         let cameras = session.cameras();
@@ -65,10 +66,16 @@ impl Session {
     /// What a session will take from the system, to the byte, before it is made. Results that the program holds come on
     /// top, half of `output` each; the model and the rig are mapped and shared.
     #[staticmethod]
-    #[pyo3(signature = (model, cameras = None, *, threads = None, logits = false))]
-    fn memory(model: &Model, cameras: Option<usize>, threads: Option<usize>, logits: bool) -> Outcome<Memory> {
+    #[pyo3(signature = (model, cameras = None, *, threads = None, logits = false, confidence = false))]
+    fn memory(
+        model: &Model,
+        cameras: Option<usize>,
+        threads: Option<usize>,
+        logits: bool,
+        confidence: bool,
+    ) -> Outcome<Memory> {
         let cameras = cameras.unwrap_or_else(|| model.model.network().cameras);
-        let options = options(threads, logits, None)?;
+        let options = options(threads, logits, confidence, None)?;
         Ok(Memory::of(&voxcast::Session::memory(&model.model, cameras, &options)?))
     }
 

@@ -66,6 +66,25 @@ def test_shards_are_merged_and_frames_scored_one_by_one(place, model, heldout, s
             evaluation.add(json.dumps(wrong))
 
 
+def test_confidence_is_fitted_and_its_calibration_counted(place, program, model, heldout):
+    fitted = voxcast.calibrate_confidence(model, heldout, place / "fitted.safetensors", limit=2, threads=1)
+    assert fitted.temperature > 0 and fitted.path == place / "fitted.safetensors"
+    arguments = ["--data", heldout, "--limit", 2, "-o", place / "same.safetensors"]
+    program("calibrate-confidence", model.path, *arguments)
+    assert (place / "same.safetensors").read_bytes() == (place / "fitted.safetensors").read_bytes()
+    report = voxcast.evaluate(fitted, heldout, calibration=True, limit=3, threads=2)
+    calibration = report.to_dict()["calibration"]["all"]["occupied"]
+    assert 0 <= calibration["expected_error"] < 0.2
+    program("eval", "--model", fitted.path, "--data", heldout, "--limit", 3, "--calibration", "--json", place / "sure.json")
+    assert json.loads((place / "sure.json").read_text())["calibration"]["all"]["occupied"] == calibration
+    report.write_reliability(place / "reliability.png")
+    assert (place / "reliability.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(voxcast.MismatchError, match="expected an evaluation with calibration"):
+        voxcast.evaluate(model, heldout, limit=1).write_reliability(place / "none.png")
+    with pytest.raises(ValueError, match="expected synthetic:DIR"):
+        voxcast.calibrate_confidence(model, "heldout", place / "none.safetensors")
+
+
 def test_two_models_are_compared(model, heldout):
     twin = voxcast.Model.from_bytes(model.to_bytes())
     report = voxcast.evaluate([model, twin], heldout, limit=2, threads=1).to_dict()

@@ -113,10 +113,30 @@ def test_results_stay_are_not_copied_and_lend_their_memory(session, scene):
     assert occupancy.digest == digest, "a result outlives its session"
 
 
+def test_confidence_is_that_of_the_command_line(program, place, model, scene, rig):
+    scene.save(place / "sure")
+    program("run", "--model", model.path, place / "sure", "-o", place / "sure.npz", "--confidence")
+    stored = numpy.load(place / "sure.npz")
+    occupancy = voxcast.Session(model, rig, threads=2, confidence=True, logits=True).run(scene)
+    assert numpy.array_equal(occupancy.confidence_occupied, stored["confidence_occupied"])
+    assert numpy.array_equal(occupancy.confidence_class, stored["confidence_class"])
+    scaled = occupancy.logits.astype(float) / model.temperature
+    powers = numpy.exp(scaled - scaled.max(-1, keepdims=True))
+    shares = powers / powers.sum(-1, keepdims=True)
+    assert numpy.abs(occupancy.confidence_occupied - 255 * (1 - shares[..., 0])).max() < 0.51
+    assert numpy.abs(occupancy.confidence_class - 255 * shares.max(-1)).max() < 0.51
+    assert not occupancy.confidence_class.flags.writeable
+    page = voxcast.view(occupancy, scene).html
+    plain = voxcast.Session(model, rig).run(scene)
+    assert plain.confidence_occupied is None and plain.confidence_class is None
+    assert plain.digest == occupancy.digest
+    assert '"confidence":null' in voxcast.view(plain).html and '"confidence":null' not in page
+
+
 def test_memory_is_told_beforehand(model, rig):
-    for threads, logits in [(1, False), (2, True)]:
-        told = voxcast.Session.memory(model, threads=threads, logits=logits)
-        session = voxcast.Session(model, rig, threads=threads, logits=logits)
+    for threads, logits, confidence in [(1, False, False), (2, True, False), (1, False, True)]:
+        told = voxcast.Session.memory(model, threads=threads, logits=logits, confidence=confidence)
+        session = voxcast.Session(model, rig, threads=threads, logits=logits, confidence=confidence)
         assert session.taken == told
         assert told.total == told.arena + told.images + told.output + told.tables
     assert voxcast.Session.memory(model, 3).images * 2 == voxcast.Session.memory(model, 6).images

@@ -28,6 +28,7 @@ from ._native import (
     Session,
     Worker,
     __version__,
+    calibrate_confidence,
     merge,
     view,
 )
@@ -53,6 +54,7 @@ __all__ = [
     "UnsupportedError",
     "Worker",
     "__version__",
+    "calibrate_confidence",
     "evaluate",
     "import_checkpoint",
     "merge",

@@ -15,6 +15,7 @@ def evaluate(
     data: str,
     *,
     losses: bool = False,
+    calibration: bool = False,
     limit: int | None = None,
     shard: str | None = None,
     resume: str | os.PathLike[str] | None = None,
@@ -27,7 +28,8 @@ def evaluate(
 
     data: as on the command line: "synthetic:DIR", "surroundocc:ROOT:LABELS[:SCENES]", "occ3d:ROOT:LABELS[:SCENES]",
         "semantickitti:ROOT[:SPLIT[:stereo]]", "uniocc:ROOT[:IMAGES]" and others (docs/evaluation.md).
-    losses: also the four losses of the training. limit: only the first frames. shard: "I/N", see docs/many-machines.md.
+    losses: also the four losses of the training.
+    calibration: also how often what the network says is so likely comes true. limit: only the first frames. shard: "I/N", see docs/many-machines.md.
     resume: a journal of every frame's score, from which the same call goes on.
     workers: frames at a time, with `threads` in all; by default as many as `voxcast eval` takes. None of it changes a number.
     progress: called with the frames done and all that were left; by default a line on a terminal.
@@ -37,7 +39,7 @@ def evaluate(
     """
     models = [model] if isinstance(model, Model) else list(model)
     journal = None if resume is None else os.fspath(resume)
-    evaluation = Evaluation(models, data, losses=losses, limit=limit, shard=shard, resume=journal)
+    evaluation = Evaluation(models, data, losses=losses, calibration=calibration, limit=limit, shard=shard, resume=journal)
     left = len(evaluation.left)
     told = progress or terminal_progress("scoring")
     evaluation.run(workers=workers, threads=threads, isa=isa, watch=lambda done: told(done, left))

@@ -21,6 +21,7 @@ __all__ = [
     "Session",
     "Worker",
     "__version__",
+    "calibrate_confidence",
     "import_file",
     "import_tensors",
     "merge",
@@ -60,6 +61,8 @@ class Model:
     def classes(self) -> list[str]: ...
     @property
     def precision(self) -> str: ...
+    @property
+    def temperature(self) -> float: ...
     @property
     def checksum(self) -> str | None: ...
     @property
@@ -141,6 +144,10 @@ class Occupancy:
     @property
     def logits(self) -> NDArray[np.float32] | None: ...
     @property
+    def confidence_occupied(self) -> NDArray[np.uint8] | None: ...
+    @property
+    def confidence_class(self) -> NDArray[np.uint8] | None: ...
+    @property
     def digest(self) -> str: ...
     @property
     def logits_digest(self) -> str | None: ...
@@ -163,11 +170,17 @@ class Session:
         *,
         threads: int | None = None,
         logits: bool = False,
+        confidence: bool = False,
         isa: _Isa | None = None,
     ) -> Session: ...
     @staticmethod
     def memory(
-        model: Model, cameras: int | None = None, *, threads: int | None = None, logits: bool = False
+        model: Model,
+        cameras: int | None = None,
+        *,
+        threads: int | None = None,
+        logits: bool = False,
+        confidence: bool = False,
     ) -> Memory: ...
     @property
     def cameras(self) -> int: ...
@@ -200,6 +213,7 @@ class Evaluation:
         data: str,
         *,
         losses: bool = False,
+        calibration: bool = False,
         limit: int | None = None,
         shard: str | None = None,
         resume: _Path | None = None,
@@ -236,6 +250,7 @@ class Report:
     def write_json(self, path: _Path) -> None: ...
     def write_markdown(self, path: _Path) -> None: ...
     def write_confusion(self, path: _Path) -> None: ...
+    def write_reliability(self, path: _Path) -> None: ...
     def _repr_markdown_(self) -> str: ...
 
 def view(
@@ -246,6 +261,15 @@ def view(
     title: str = "voxcast",
     subtitle: str = "",
 ) -> Page: ...
+def calibrate_confidence(
+    model: Model,
+    data: str,
+    output: _Path,
+    *,
+    limit: int | None = None,
+    threads: int | None = None,
+    isa: _Isa | None = None,
+) -> Model: ...
 def merge(journals: Sequence[_Path], *, limit: int | None = None) -> Report: ...
 def network_json(name: str) -> str: ...
 def import_file(checkpoint: _Path, wish: _Wish) -> Model: ...

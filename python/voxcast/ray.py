@@ -66,6 +66,7 @@ def evaluate(
     data: str,
     *,
     losses: bool = False,
+    calibration: bool = False,
     limit: int | None = None,
     resume: str | os.PathLike[str] | None = None,
     actors: int | None = None,
@@ -87,10 +88,10 @@ def evaluate(
     """
     models = [model] if isinstance(model, Model) else list(model)
     journal = None if resume is None else os.fspath(resume)
-    evaluation = Evaluation(models, data, losses=losses, limit=limit, resume=journal)
+    evaluation = Evaluation(models, data, losses=losses, calibration=calibration, limit=limit, resume=journal)
     left = evaluation.left
     told = progress or terminal_progress("scoring")
-    arguments = (models, data, losses, limit, threads)
+    arguments = (models, data, losses, calibration, limit, threads)
     done = 0
     with _Crew[int, str](_Scorer, arguments, actors, threads, patience) as crew:
         for _, line, _ in crew.compute(left, _spread(len(left), check), lambda line: line):
@@ -133,13 +134,16 @@ def _spread(count: int, wanted: int) -> set[int]:
 class _Scorer:
     """The actor that scores frames."""
 
-    def __init__(self, models: list[Model], data: str, losses: bool, limit: int | None, threads: int) -> None:
-        self.arguments = (models, data, losses, limit, threads)
+    def __init__(
+        self, models: list[Model], data: str, losses: bool, calibration: bool, limit: int | None, threads: int
+    ) -> None:
+        self.arguments = (models, data, losses, calibration, limit, threads)
 
     def ready(self) -> str:
         """Opens what is needed. Errors are the caller's to see, which those of a constructor are not."""
-        models, data, losses, limit, threads = self.arguments
-        self.worker = Worker(Evaluation(models, data, losses=losses, limit=limit), threads=threads)
+        models, data, losses, calibration, limit, threads = self.arguments
+        evaluation = Evaluation(models, data, losses=losses, calibration=calibration, limit=limit)
+        self.worker = Worker(evaluation, threads=threads)
         return str(ray.get_runtime_context().get_node_id())
 
     def compute(self, index: int) -> str:

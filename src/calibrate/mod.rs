@@ -51,7 +51,7 @@ impl Calibrator {
             return refused("that keeps its batch norms", "with folded batch norms");
         }
         let options = SessionOptions { isa, threads: threads.clone(), logits: true, ..SessionOptions::default() };
-        let results = Results { logits: true, coarse_heads: true };
+        let results = Results { coarse_heads: true, logits: true, ..Results::default() };
         let graph = model.graph(false, results).with_hidden_layers();
         Ok(Self { model, options, graph, session: None, histograms: BTreeMap::new(), frames: 0 })
     }

@@ -14,9 +14,14 @@ use voxcast_kernels::{Isa, IsaError};
 pub(super) unsafe fn read(options: *const Options) -> Outcome<SessionOptions> {
     let default = SessionOptions::default();
     // SAFETY: this function's own condition. Any bits are an `Options`.
-    let Some(Options { isa, threads, logits, slice_cost, .. }) = (unsafe { sized(options, "options") })? else {
+    let Some(Options { isa, threads, logits, slice_cost, confidence, reserved, .. }) =
+        (unsafe { sized(options, "options") })?
+    else {
         return Ok(default);
     };
+    if reserved != 0 {
+        return Err(invalid("options: reserved is not 0"));
+    }
     if threads > MAX_THREADS {
         return Err(invalid(format!("options: {threads} threads, at most {MAX_THREADS}")));
     }
@@ -32,6 +37,7 @@ pub(super) unsafe fn read(options: *const Options) -> Outcome<SessionOptions> {
         isa,
         threads: Threads::new(threads as usize)?,
         logits: logits != 0,
+        confidence: confidence != 0,
         slice_cost: if slice_cost == 0 { default.slice_cost } else { slice_cost },
         ..default
     })

@@ -40,8 +40,18 @@ fn no_logits() -> Failure {
     Failure::new(Status::Unsupported, "the session keeps no logits: its options did not ask for them")
 }
 
+fn no_confidence() -> Failure {
+    let message = "the session does not say how sure it is: its options did not ask for the confidence";
+    Failure::new(Status::Unsupported, message)
+}
+
 fn voxels(session: &Session) -> usize {
     session.model().network().output_grid().iter().product()
+}
+
+/// Voxels of which it is known how sure the network is.
+fn confidences(session: &Session) -> Outcome<usize> {
+    session.keeps_confidence().then(|| voxels(session)).ok_or_else(no_confidence)
 }
 
 fn put<T>(out: &mut [MaybeUninit<T>], values: impl Iterator<Item = T>) {
@@ -84,6 +94,42 @@ unsafe extern "C" fn voxcast_session_logits(
     let write = |o: Occupancy<'_>, out: &mut [MaybeUninit<f32>]| put(out, o.logits.unwrap_or_default().iter().copied());
     // SAFETY: `logits` and `message` are null or have room, as the header asks of the caller.
     unsafe { copy(session, Room::new(logits, room, length), elements, write, (message, capacity)) }
+}
+
+/// # Safety
+/// The pointers are as `voxcast.h` says.
+#[unsafe(no_mangle)]
+unsafe extern "C" fn voxcast_session_confidence_occupied(
+    session: Option<&SessionHandle>,
+    codes: *mut u8,
+    room: usize,
+    length: Option<&mut MaybeUninit<usize>>,
+    message: *mut c_char,
+    capacity: usize,
+) -> i32 {
+    let write = |o: Occupancy<'_>, out: &mut [MaybeUninit<u8>]| {
+        put(out, o.confidence.iter().flat_map(|sure| sure.occupied).copied());
+    };
+    // SAFETY: `codes` and `message` are null or have room, as the header asks of the caller.
+    unsafe { copy(session, Room::new(codes, room, length), confidences, write, (message, capacity)) }
+}
+
+/// # Safety
+/// The pointers are as `voxcast.h` says.
+#[unsafe(no_mangle)]
+unsafe extern "C" fn voxcast_session_confidence_class(
+    session: Option<&SessionHandle>,
+    codes: *mut u8,
+    room: usize,
+    length: Option<&mut MaybeUninit<usize>>,
+    message: *mut c_char,
+    capacity: usize,
+) -> i32 {
+    let write = |o: Occupancy<'_>, out: &mut [MaybeUninit<u8>]| {
+        put(out, o.confidence.iter().flat_map(|sure| sure.class).copied());
+    };
+    // SAFETY: `codes` and `message` are null or have room, as the header asks of the caller.
+    unsafe { copy(session, Room::new(codes, room, length), confidences, write, (message, capacity)) }
 }
 
 /// # Safety

@@ -80,6 +80,8 @@ pub(crate) struct Options {
     pub(crate) threads: u32,
     pub(crate) logits: u32,
     pub(crate) slice_cost: u64,
+    pub(crate) confidence: u32,
+    pub(crate) reserved: u32,
 }
 
 /// `voxcast_image`: a camera's image where the caller has it.

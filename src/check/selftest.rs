@@ -11,10 +11,9 @@ use crate::base::digest;
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::base::random::Random;
 use crate::base::threads::Threads;
-use crate::file::container::{self, Data, Tensor};
 use crate::graph::Elements;
 use crate::image::ImageView;
-use crate::model::{self, Model};
+use crate::model::Model;
 use crate::network::Network;
 use crate::rig::RigBuilder;
 use crate::runtime::session::{Session, SessionOptions};
@@ -188,13 +187,7 @@ pub fn record(path: &Path, isa: Isa, threads: &Threads) -> Result<()> {
     let test = SelfTest { seed: SEED, operations, classes, logits };
     let mut metadata = model.metadata().clone();
     metadata.insert(KEY.to_owned(), serde_json::to_string(&test).unwrap_or_default());
-    let tensors = model.contents().map(|(name, dtype, shape, bytes)| Tensor {
-        name,
-        dtype,
-        shape: shape.to_vec(),
-        data: Data::Bytes(bytes),
-    });
-    container::write(path, tensors.collect(), &metadata, model::LAYOUT)
+    model.save_with(path, &metadata)
 }
 
 #[cfg(test)]

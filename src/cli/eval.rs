@@ -21,6 +21,7 @@ Examples:
   voxcast eval --model model.safetensors --data synthetic:heldout
   voxcast eval --model model.safetensors --data synthetic:heldout --json scores.json --markdown scores.md
   voxcast eval --model model.safetensors --data synthetic:heldout --resume scores.jsonl --confusion confusion.png
+  voxcast eval --model model.safetensors --data synthetic:heldout --calibration --reliability reliability.png
   voxcast eval --compare f32.safetensors f16.safetensors --data synthetic:heldout
   voxcast eval --majority synthetic:train --data synthetic:heldout    # what can be said without looking
   voxcast eval --model model.safetensors --data surroundocc:nuscenes:nuscenes_occ:val
@@ -56,6 +57,13 @@ pub struct Eval {
     /// Also compute the four losses of the training, of level 0
     #[arg(long, conflicts_with = "majority")]
     losses: bool,
+    /// Also count how often what the network says is so likely comes true: the expected calibration error of "occupied" and of
+    /// the class, and precision and recall of "occupied" from each probability on
+    #[arg(long, conflicts_with = "majority")]
+    calibration: bool,
+    /// Draw the reliability diagram of that. With --merge, of shards that had --calibration
+    #[arg(long, value_name = "FILE.png", conflicts_with = "majority")]
+    reliability: Option<PathBuf>,
     /// Keep every frame's score in FILE, and go on from those that are there already, after a stop or with a higher
     /// --limit
     #[arg(long, value_name = "FILE")]
@@ -66,12 +74,13 @@ pub struct Eval {
     shard: Option<ShardArgument>,
     /// Instead of scoring, put together what --resume kept for each shard. Takes --limit, if the shards had it
     #[arg(long, value_name = "JOURNAL", num_args = 1..,
-        conflicts_with_all = ["model", "compare", "majority", "data", "losses", "resume", "shard"])]
+        conflicts_with_all = ["model", "compare", "majority", "data", "losses", "calibration", "resume",
+            "shard"])]
     merge: Vec<PathBuf>,
     /// Instead of scoring, write what OpenOcc v2's challenge takes, gzip of a pickle: class and distance along its rays. For
     /// openocc sets; LABELS is not read, and may be any word where there are none
-    #[arg(long, value_name = "FILE.gz", conflicts_with_all = ["compare", "merge", "losses", "resume", "shard",
-        "confusion", "json", "markdown"])]
+    #[arg(long, value_name = "FILE.gz", conflicts_with_all = ["compare", "merge", "losses", "calibration",
+        "reliability", "resume", "shard", "confusion", "json", "markdown"])]
     submission: Option<PathBuf>,
     /// What the submission says of itself: method, team, authors, e-mail, "institution / company" or "country / region".
     /// May be given again
@@ -101,8 +110,8 @@ fn about(text: &str) -> std::result::Result<(String, String), String> {
 
 impl Eval {
     pub fn run(self) -> Result<()> {
-        for path in [&self.json, &self.markdown, &self.confusion, &self.resume, &self.submission].into_iter().flatten()
-        {
+        let outputs = [&self.json, &self.markdown, &self.confusion, &self.reliability, &self.resume, &self.submission];
+        for path in outputs.into_iter().flatten() {
             frame::check_output(path)?;
         }
         self.check_apart()?;
@@ -137,7 +146,8 @@ impl Eval {
         };
         let set = data.open()?;
         let predictors = self.predictors(&*set, data)?;
-        let scope = Scope { losses: self.losses, limit, shard, ..Scope::default() };
+        let calibration = self.calibration || self.reliability.is_some();
+        let scope = Scope { losses: self.losses, calibration, limit, shard, ..Scope::default() };
         let evaluation = Arc::new(Evaluation::new(set, &data.to_string(), predictors, &scope)?);
         let mut totals = evaluation.totals();
         let mut journal = self.resume.as_deref().map(|path| evaluation.resume(path, &mut totals)).transpose()?;
@@ -166,6 +176,7 @@ impl Eval {
             ("--json", &self.json),
             ("--markdown", &self.markdown),
             ("--confusion", &self.confusion),
+            ("--reliability", &self.reliability),
         ];
         for (flag, path) in merged.chain(outputs.iter().filter_map(|(flag, path)| Some((*flag, path.as_ref()?)))) {
             let place = std::path::absolute(path).map_err(|e| Error::io(path, "find", &e))?;
@@ -203,6 +214,9 @@ impl Eval {
         }
         if let Some(path) = &self.confusion {
             summary.write_confusion(path)?;
+        }
+        if let Some(path) = &self.reliability {
+            summary.write_reliability(path)?;
         }
         Ok(())
     }

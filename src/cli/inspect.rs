@@ -74,6 +74,7 @@ impl Inspect {
                 "batch_norm_folded": rewrites.batch_norm,
                 "projection_folded": rewrites.projection,
                 "winograd_used": rewrites.winograd,
+                "temperature": model.temperature().value(),
                 "stored_numbers": parameters,
                 "file_bytes": model.file_size(),
                 "checksum": model.checksum().map(|c| format!("{c:016x}")),
@@ -122,6 +123,7 @@ impl Inspect {
                 kept.len()
             );
         }
+        println!("confidence softmax at temperature {}", model.temperature());
         println!("file       {}", terminal::bytes(model.file_size()));
         println!("images     {} x {} (height x width, padded)", network.image[0], network.image[1]);
         println!("output     {x} x {y} x {z} voxels, {} classes", network.classes);

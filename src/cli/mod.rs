@@ -1,6 +1,7 @@
 //! Arguments and commands. One file per command under `cli/`.
 
 mod calibrate;
+mod calibrate_confidence;
 mod compare;
 mod demo;
 mod dump;
@@ -54,6 +55,8 @@ enum Command {
     Import(import::Import),
     /// Measure the ranges of a model's tensors on scenes, for int8
     Calibrate(calibrate::Calibrate),
+    /// Fit the temperature of a model's probabilities to labels
+    CalibrateConfidence(calibrate_confidence::CalibrateConfidence),
     /// Build the projection matrices of a scene's cameras
     Rig(rig::BuildRig),
     /// Run a model on a scene
@@ -80,6 +83,7 @@ impl Arguments {
             Command::Demo(command) => command.run(),
             Command::Import(command) => command.run(),
             Command::Calibrate(command) => command.run(),
+            Command::CalibrateConfidence(command) => command.run(),
             Command::Rig(command) => command.run(),
             Command::Run(command) => command.run(),
             Command::View(command) => command.run(),

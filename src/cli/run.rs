@@ -4,6 +4,7 @@ use super::dump::Dump;
 use super::view::name_of;
 use super::{Machine, frame, terminal};
 use clap::Args;
+use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -11,7 +12,7 @@ use std::time::{Duration, Instant};
 use voxcast::html::Page;
 use voxcast::npz::{Array, Elements, write_npz};
 use voxcast::picture::{self, Figure, Palette};
-use voxcast::session::{Occupancy, views};
+use voxcast::session::{Confidence, Occupancy, views};
 use voxcast::{Error, Network, Note, Result, Scene};
 
 /// Run a model on a scene, a drive or a robot log and write the class of every voxel.
@@ -25,6 +26,7 @@ Examples:
   voxcast run --model model.safetensors scene/ -o out.npz
   voxcast run --model model.safetensors --rig rig.safetensors scene/ -o out.npz --logits --png out.png
   voxcast run --model model.safetensors scene/ -o out.npz --html out.html
+  voxcast run --model model.safetensors scene/ -o out.npz --confidence --html out.html
   voxcast run --model model.safetensors scene/ -o out.npz --mask CAM_BACK,2
   voxcast run --model model.safetensors drive/ -o out/ --animation drive.png
   voxcast run --model model.safetensors drive/ -o out.mcap          # opens in Foxglove, Rerun and PlotJuggler
@@ -34,6 +36,8 @@ Examples:
 
 In Python: numpy.load('out.npz')['classes'] is u8 [X, Y, Z], and ['support'] u16 [X, Y, Z] says by how many feature
 pixels each voxel is seen: where it is 0, no camera sees the place, and its class is a guess. Pictures hatch such places.
+With --confidence, ['confidence_occupied'] / 255 is the probability that a voxel is occupied, ['confidence_class'] / 255 that of
+its class, by a softmax with the temperature that `calibrate-confidence` has fitted, if any.
 ['bounds'] f32 [3, 2] are the grid's metres, ['colours'] u8 [K, 3] those of the classes in pictures.
 Without --rig the matrices are built from the scene's calibration before the frame. A rig that was made from another
 calibration is an error, unless --any-rig is given; one that does not say from which, as those of other programs, is used,
@@ -60,6 +64,13 @@ pub struct Run {
     /// Also write `logits` f32 [X, Y, Z, K]
     #[arg(long)]
     pub(super) logits: bool,
+    /// Also write how sure the network is: `confidence_occupied` and `confidence_class`, u8 [X, Y, Z], 0 to 255 for
+    /// probabilities from 0 to 1. Pages get a slider, logs two fields
+    #[arg(long)]
+    pub(super) confidence: bool,
+    /// In pictures, leave out voxels that are occupied with a lower probability than P, 0 to 1
+    #[arg(long, value_name = "P", value_parser = probability)]
+    pub(super) hide_below: Option<f32>,
     /// Draw images, bird's-eye view and voxels
     #[arg(long, value_name = "FILE")]
     pub(super) png: Option<PathBuf>,
@@ -106,6 +117,12 @@ pub struct Run {
     pub(super) machine: Machine,
 }
 
+/// A number from 0 to 1.
+fn probability(text: &str) -> std::result::Result<f32, String> {
+    let value: Option<f32> = text.parse().ok().filter(|value| (0.0..=1.0).contains(value));
+    value.ok_or_else(|| "expected a number from 0 to 1".to_owned())
+}
+
 /// `NAME=TOPIC`.
 fn camera(text: &str) -> std::result::Result<(String, String), String> {
     let parts = text.split_once('=').filter(|(name, topic)| !name.is_empty() && !topic.is_empty());
@@ -128,6 +145,7 @@ impl Run {
         let mut dump = self.dump.as_ref().map(|_| Dump::new(self.stages.as_deref(), model.network())).transpose()?;
         let mut options = frame::options(&self.machine)?;
         options.logits = self.logits;
+        options.confidence = self.wants_confidence();
         options.unfolded = self.unfolded || dump.as_ref().is_some_and(|d| d.needs_unfolded(model.network()));
         options.coarse_heads = dump.as_ref().is_some_and(Dump::needs_coarse_heads);
         options.logits |= dump.as_ref().is_some_and(|d| d.wants("logits.lvl0"));
@@ -166,7 +184,7 @@ impl Run {
         let network = model.network();
         write(&self.output, network, &result, self.logits)?;
         if let Some(path) = &self.png {
-            draw(network, &scene, &result, &title(&self.model), "")?.write_png(path)?;
+            draw(network, &scene, &result, &title(&self.model), "", self.hide_below)?.write_png(path)?;
         }
         if let Some(path) = &self.html {
             let page = name_of(&self.output);
@@ -178,6 +196,11 @@ impl Run {
         let summary = Summary { loaded, rig_time, mapped: self.rig.is_some(), frame_time, notes };
         summary.print(network, &result, self.json);
         Ok(())
+    }
+
+    /// Whether it is asked how sure the network is.
+    pub(super) fn wants_confidence(&self) -> bool {
+        self.confidence || self.hide_below.is_some()
     }
 
     pub(super) fn rig_file(&self) -> frame::RigFile<'_> {
@@ -219,6 +242,10 @@ pub fn write(path: &Path, network: &Network, result: &Occupancy<'_>, logits: boo
     if let Some(values) = result.logits.filter(|_| logits) {
         arrays.push(Array { name: "logits", shape: &shape, elements: Elements::F32(values) });
     }
+    if let Some(Confidence { occupied, class }) = result.confidence {
+        let array = |name, codes| Array { name, shape: &shape[..3], elements: Elements::U8(codes) };
+        arrays.extend([array("confidence_occupied", occupied), array("confidence_class", class)]);
+    }
     arrays.push(Array { name: "support", shape: &shape[..3], elements: Elements::U16(result.support) });
     arrays.push(Array { name: "bounds", shape: &[3, 2], elements: Elements::F32(result.grid.bounds.as_flattened()) });
     arrays.push(colours);
@@ -235,22 +262,34 @@ pub fn write_page(
     [title, subtitle]: [&str; 2],
 ) -> Result<()> {
     let palette = Palette::of(network.classes);
-    let prediction = picture::Occupancy::new("", result.classes, result.grid, result.grid.forward())?
+    let mut prediction = picture::Occupancy::new("", result.classes, result.grid, result.grid.forward())?
         .with_support(result.support)?;
+    if let Some(confidence) = result.confidence {
+        prediction = prediction.with_confidence(confidence.occupied)?;
+    }
     Page { title, subtitle, prediction, truth, scene, palette: &palette }.write(path)
 }
 
-/// The picture of a result.
+/// The picture of a result, without the voxels that are occupied with a lower probability than `hide_below`, if the result says
+/// how sure it is.
 pub fn draw(
     network: &Network,
     scene: &Scene,
     result: &Occupancy<'_>,
     title: &str,
     subtitle: &str,
+    hide_below: Option<f32>,
 ) -> Result<picture::Picture> {
     let palette = Palette::of(network.classes);
-    let occupancy = picture::Occupancy::new("", result.classes, result.grid, result.grid.forward())?
-        .with_support(result.support)?;
+    let classes = match result.confidence.zip(hide_below) {
+        None => Cow::Borrowed(result.classes),
+        Some((confidence, least)) => {
+            let drawn = |(&class, &code): (&u8, &u8)| if f32::from(code) < 255.0 * least { 0 } else { class };
+            Cow::Owned(result.classes.iter().zip(confidence.occupied).map(drawn).collect())
+        }
+    };
+    let occupancy =
+        picture::Occupancy::new("", &classes, result.grid, result.grid.forward())?.with_support(result.support)?;
     let images: Vec<_> = scene.names.iter().map(String::as_str).zip(&scene.images).collect();
     Ok(picture::draw(&Figure { title, subtitle, images: &images, occupancies: &[occupancy], palette: &palette }))
 }

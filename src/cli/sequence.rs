@@ -90,6 +90,7 @@ impl Run {
         let mut results = Results::create(self, model.network())?;
         let mut options = frame::options(&self.machine)?;
         options.logits = self.logits;
+        options.confidence = self.wants_confidence();
         options.unfolded = self.unfolded;
 
         let mut driver: Option<Driver> = None;
@@ -119,7 +120,7 @@ impl Run {
             let latency = start.elapsed();
             if let Some(path) = &self.animation {
                 let subtitle = format!("{}, {} of {count}", frame.name, index + 1);
-                let page = draw(model.network(), scene, &result, &title(&self.model), &subtitle)?;
+                let page = draw(model.network(), scene, &result, &title(&self.model), &subtitle, self.hide_below)?;
                 let page = page.scaled(usize::from(self.width));
                 let animation = match &mut animation {
                     Some(animation) => animation,

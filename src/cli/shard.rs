@@ -66,7 +66,8 @@ fn kubernetes(variable: &dyn Fn(&str) -> Option<String>) -> Result<Shard> {
 }
 
 fn number(name: &str, variable: &dyn Fn(&str) -> Option<String>) -> Result<usize> {
-    let found = variable(name).ok_or_else(|| Error::mismatch(format!("--shard auto: {name} is not set")))?;
+    let found =
+        variable(name).ok_or_else(|| Error::mismatch(format!("--shard auto: {name} is not set, expected a number")))?;
     let message = || Error::mismatch(format!("--shard auto: {name} is {found:?}, expected a number"));
     found.parse().map_err(|_| message())
 }
@@ -115,8 +116,12 @@ mod tests {
             (&slurm_array("3", "1", "7", "3", "1"), "3 from 1 to 7 in steps of 1, expected one without gaps"),
             (&slurm_array("3", "2", "6", "3", "2"), "without gaps"),
             (&slurm_array("x", "1", "7", "3", "1"), "SLURM_ARRAY_TASK_ID is \"x\""),
-            (&slurm_array("0", "0", "7", "8", "1")[..1], "SLURM_ARRAY_TASK_MIN is not set"),
+            (&slurm_array("0", "0", "7", "8", "1")[..1], "SLURM_ARRAY_TASK_MIN is not set, expected a number"),
+            (&slurm_array("0", "0", "7", "8", "1")[..3], "SLURM_ARRAY_TASK_COUNT is not set"),
+            (&slurm_array("0", "0", "7", "8", "1")[1..], "neither SLURM_ARRAY_TASK_ID nor"),
             (&[("JOB_COMPLETION_INDEX", "3")], "JOB_COMPLETIONS is not set"),
+            (&[("JOB_COMPLETIONS", "3")], "nor JOB_COMPLETION_INDEX is set"),
+            (&[("JOB_COMPLETION_INDEX", ""), ("JOB_COMPLETIONS", "4")], "JOB_COMPLETION_INDEX is \"\""),
             (&[("JOB_COMPLETION_INDEX", "4"), ("JOB_COMPLETIONS", "4")], "shard 4/4"),
         ] {
             let error = auto(variables).expect_err(expected);

@@ -13,7 +13,8 @@ use voxcast::{Error, Network, Result, Scene};
 /// Make a page of a result, to look at in a browser.
 ///
 /// The page is one file that needs nothing else and asks no network for anything: voxels to turn and to slice, classes to
-/// switch, what no camera sees, truth and difference, camera images with the voxels on them.
+/// switch, what no camera sees, how likely a voxel must be to be shown (of a result of `run --confidence`), truth and
+/// difference, camera images with the voxels on them.
 #[derive(Args, Debug)]
 #[command(after_help = "\
 Examples:
@@ -78,6 +79,7 @@ pub fn name_of(path: &Path) -> String {
 struct Stored {
     classes: Vec<u8>,
     support: Vec<u16>,
+    confidence: Vec<u8>,
     grid: Grid,
     palette: Palette,
 }
@@ -96,6 +98,11 @@ impl Stored {
         let support = match find("support") {
             Some(OwnedArray { shape, elements: OwnedElements::U16(support), .. }) if *shape == size => support.clone(),
             Some(other) => return Err(unfit(other, &format!("u16 {size:?}"))),
+            None => Vec::new(),
+        };
+        let confidence = match find("confidence_occupied") {
+            Some(OwnedArray { shape, elements: OwnedElements::U8(codes), .. }) if *shape == size => codes.clone(),
+            Some(other) => return Err(unfit(other, &format!("u8 {size:?}"))),
             None => Vec::new(),
         };
         if let Some(network) = network.filter(|network| network.output_grid() != size) {
@@ -135,12 +142,18 @@ impl Stored {
             );
             return Err(Error::mismatch(message));
         }
-        Ok(Self { classes, support, grid: Grid::new(size, bounds), palette })
+        Ok(Self { classes, support, confidence, grid: Grid::new(size, bounds), palette })
     }
 
     fn occupancy(&self) -> Result<Occupancy<'_>> {
-        let occupancy = Occupancy::new("", &self.classes, self.grid, self.grid.forward())?;
-        if self.support.is_empty() { Ok(occupancy) } else { occupancy.with_support(&self.support) }
+        let mut occupancy = Occupancy::new("", &self.classes, self.grid, self.grid.forward())?;
+        if !self.support.is_empty() {
+            occupancy = occupancy.with_support(&self.support)?;
+        }
+        if !self.confidence.is_empty() {
+            occupancy = occupancy.with_confidence(&self.confidence)?;
+        }
+        Ok(occupancy)
     }
 }
 

@@ -88,6 +88,8 @@ pub struct Scope {
     pub options: Options,
     /// Whether the losses of the training are computed.
     pub losses: bool,
+    /// Whether it is counted how often what the network was so sure of came true.
+    pub calibration: bool,
     /// Only so many frames from the first on; all if none.
     pub limit: Option<usize>,
     /// Of these, which part.
@@ -96,7 +98,7 @@ pub struct Scope {
 
 impl Default for Scope {
     fn default() -> Self {
-        Self { options: Options::default(), losses: false, limit: None, shard: Shard::WHOLE }
+        Self { options: Options::default(), losses: false, calibration: false, limit: None, shard: Shard::WHOLE }
     }
 }
 
@@ -147,7 +149,7 @@ impl Evaluation {
         };
         let predictors = predictors.into_iter().map(with_scorer).collect::<Result<Vec<_>>>()?;
         let identities = predictors.iter().map(|(predictor, scorer)| (predictor.identity(), scorer.published()));
-        let what = Subject::new(&*set, data, identities.collect(), &scope.options, scope.losses);
+        let what = Subject::new(&*set, data, identities.collect(), scope);
         let names = predictors.iter().map(|(predictor, _)| predictor.name.clone()).collect();
         let header = Header::new(what, scope.shard, names);
         let frames = scope.limit.map_or(set.len(), |limit| set.len().min(limit));
@@ -294,7 +296,8 @@ pub struct Worker {
 impl Worker {
     /// A worker with threads of its own. It takes memory for its sessions when the first frame comes.
     pub fn new(evaluation: Arc<Evaluation>, isa: Isa, threads: Threads) -> Self {
-        let options = SessionOptions { isa, threads, logits: evaluation.what().losses, ..SessionOptions::default() };
+        let &Subject { losses: logits, calibration: confidence, .. } = evaluation.what();
+        let options = SessionOptions { isa, threads, logits, confidence, ..SessionOptions::default() };
         let running = evaluation.predictors.iter().map(|_| None).collect();
         Self { evaluation, options, running, notes: Vec::new() }
     }
@@ -330,11 +333,11 @@ impl Worker {
         for ((Predictor { says, .. }, scorer), running) in predictors.iter().zip(&mut self.running) {
             let prediction = match (says, &scene) {
                 (Says::Model(model), Some(scene)) => {
-                    let Occupancy { classes, support, logits, .. } =
+                    let Occupancy { classes, support, logits, confidence, .. } =
                         run(running, model, scene, &self.options).map_err(said)?;
-                    Prediction { classes, support: Some(support), logits }
+                    Prediction { classes, support: Some(support), logits, confidence }
                 }
-                (Says::Always(classes, _), _) => Prediction { classes, support: None, logits: None },
+                (Says::Always(classes, _), _) => Prediction { classes, support: None, logits: None, confidence: None },
                 // Not reached: a scene is read where a model is among the predictors.
                 (Says::Model(_), None) => continue,
             };

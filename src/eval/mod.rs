@@ -19,11 +19,13 @@ mod journal;
 pub mod losses;
 mod majority;
 pub mod ray_iou;
+pub mod reliability;
 mod report;
 mod subject;
 mod submission;
 mod summary;
 mod table;
+mod temperature;
 mod totals;
 
 pub use comparison::Comparison;
@@ -36,13 +38,16 @@ pub use report::Report;
 pub use subject::{Shard, Subject};
 pub use submission::{ABOUT, write_submission};
 pub use summary::Summary;
+pub use temperature::{Fit, fit_temperature};
 pub use totals::{FrameScore, Totals};
 
 use crate::base::error::{Error, Result};
 use crate::eval::dataset::{Axes, Grid, IGNORED, OTHERS, Pose, Truth, is_class};
 use crate::file::replace::replace_file;
+use crate::runtime::session::Confidence;
 use losses::{Losses, losses};
 use ray_iou::{RayCounts, count_rays};
+use reliability::Calibration;
 use std::borrow::Cow;
 use std::io::Write;
 use std::path::Path;
@@ -57,6 +62,8 @@ pub struct Prediction<'a> {
     pub support: Option<&'a [u16]>,
     /// Logits `[x, y, z, classes]`, if the losses are to be known. Truth must then have the prediction's grid.
     pub logits: Option<&'a [f32]>,
+    /// How sure the network is of each voxel, if its calibration is to be known.
+    pub confidence: Option<Confidence<'a>>,
 }
 
 /// What to score.
@@ -192,8 +199,15 @@ impl Scorer {
                         score.regions[region][ring].add(label, class);
                     }
                 }
-                if prediction.support.zip(at).is_some_and(|(support, at)| support[at] > 0) {
+                let supported = prediction.support.zip(at).is_some_and(|(support, at)| support[at] > 0);
+                if supported {
                     score.regions[self.masks + 1][ring].add(label, class);
+                }
+                let Some((confidence, at)) = prediction.confidence.zip(at) else { continue };
+                let masks = truth.masks.iter().map(|mask| mask[first + z] != 0);
+                let within = std::iter::once(true).chain(masks).chain([supported]);
+                for (calibration, _) in score.calibration.iter_mut().zip(within).filter(|(_, within)| *within) {
+                    calibration.add([confidence.occupied[at], confidence.class[at]], label, class);
                 }
             }
         }
@@ -261,6 +275,9 @@ impl Scorer {
         }
         check("predicted voxels", prediction.classes.len(), predicted)?;
         check("voxels with support", prediction.support.map_or(predicted, <[u16]>::len), predicted)?;
+        for codes in prediction.confidence.iter().flat_map(|confidence| [confidence.occupied, confidence.class]) {
+            check("voxels with confidence", codes.len(), predicted)?;
+        }
         if let Some(logits) = prediction.logits {
             if self.truth != self.prediction {
                 let message = "losses need labels on the grid of the network, which these are not";
@@ -310,6 +327,9 @@ pub struct Score {
     pub rays: RayCounts,
     /// Losses of level 0 of the frames whose logits were given.
     pub losses: LossSum,
+    /// For each region, how often what the network was so sure of came true, in the voxels of which it speaks; nothing counted
+    /// where it did not say how sure it is.
+    pub calibration: Vec<Calibration>,
 }
 
 /// Losses, summed over frames.
@@ -354,7 +374,8 @@ impl Score {
     pub fn new(kind: Kind) -> Self {
         let regions = vec![vec![Confusion::new(kind.classes); kind.rings]; kind.regions];
         let published = Confusion::new(kind.classes + 1);
-        Self { regions, published, rays: RayCounts::new(kind.classes), losses: LossSum::default() }
+        let calibration = vec![Calibration::default(); kind.regions];
+        Self { regions, published, rays: RayCounts::new(kind.classes), losses: LossSum::default(), calibration }
     }
 
     /// Adds the counts of another score of the same kind.
@@ -366,6 +387,7 @@ impl Score {
         self.published.merge(&other.published);
         self.rays.merge(&other.rays);
         self.losses.merge(&other.losses);
+        self.calibration.iter_mut().zip(&other.calibration).for_each(|(own, other)| own.merge(other));
         for (own, other) in self.regions.iter_mut().zip(&other.regions) {
             assert_eq!(own.len(), other.len(), "rings");
             own.iter_mut().zip(other).for_each(|(own, other)| own.merge(other));

@@ -3,7 +3,7 @@
 use super::losses::Losses;
 use super::ray_iou::THRESHOLDS;
 use super::table::{Table, percent};
-use super::{Confusion, Published, Score};
+use super::{Confusion, Published, Score, reliability};
 use serde_json::{Value, json};
 
 /// A total with the names of what it counts.
@@ -82,7 +82,13 @@ impl Report<'_> {
                 "classes": ray_classes,
             },
             "losses": losses,
+            "calibration": self.is_calibrated().then(|| reliability::json(self.regions, &self.total.calibration)),
         })
+    }
+
+    /// Whether anything is known of how sure the network may be.
+    fn is_calibrated(&self) -> bool {
+        self.total.calibration.iter().any(|calibration| calibration.occupied.voxels() > 0)
     }
 
     fn ratios(&self, confusion: &Confusion) -> Value {
@@ -150,6 +156,9 @@ impl Report<'_> {
             let row = std::iter::once("level 0".to_owned()).chain(values.map(|value| format!("{value:.4}"))).collect();
             Table { head, rows: vec![row] }
         }));
+        if self.is_calibrated() {
+            tables.extend(reliability::tables(self.regions, &self.total.calibration));
+        }
         tables
     }
 

@@ -1,6 +1,6 @@
 //! What is evaluated, and which part of it is one's own.
 
-use super::{Kind, Options};
+use super::{Kind, Scope};
 use crate::base::digest;
 use crate::base::error::{Error, Result};
 use crate::eval::dataset::{DataSet, Published};
@@ -34,6 +34,8 @@ pub struct Subject {
     pub masks: Vec<String>,
     /// Whether losses are computed.
     pub losses: bool,
+    /// Whether calibration is counted.
+    pub calibration: bool,
     /// Ends of the distance rings in metres.
     pub rings: Vec<f64>,
     /// The program's version.
@@ -42,13 +44,7 @@ pub struct Subject {
 
 impl Subject {
     /// The evaluation of `predictors`, each with how its [`Published`] score is counted, on the set that was named `data`.
-    pub fn new(
-        set: &dyn DataSet,
-        data: &str,
-        predictors: Vec<(String, Option<Published>)>,
-        options: &Options,
-        losses: bool,
-    ) -> Self {
+    pub fn new(set: &dyn DataSet, data: &str, predictors: Vec<(String, Option<Published>)>, scope: &Scope) -> Self {
         let (predictors, published) = predictors.into_iter().unzip();
         let mut ids = String::new();
         for index in 0..set.len() {
@@ -67,8 +63,9 @@ impl Subject {
             bounds: grid.bounds,
             classes: owned(set.classes()),
             masks: owned(set.masks()),
-            losses,
-            rings: options.rings.clone(),
+            losses: scope.losses,
+            calibration: scope.calibration,
+            rings: scope.options.rings.clone(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
         }
     }

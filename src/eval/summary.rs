@@ -1,10 +1,11 @@
 //! What an evaluation came to: the report of one predictor or the comparison of two, and how shards are put together.
 
 use super::journal::{Entry, Header, JournalReader};
+use super::reliability::{Bin, Calibration, Reliability};
 use super::subject::Shard;
 use super::{Comparison, Confusion, FrameScore, Report, Scorer, Totals, write_text};
 use crate::base::error::{Error, Result};
-use crate::show::picture::{Matrix, Palette, draw_matrix};
+use crate::show::picture::{Curve, Diagram, Matrix, Palette, Point, draw_diagram, draw_matrix};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -120,6 +121,44 @@ impl Summary {
             let matrix = Matrix { title: &title, subtitle: &subtitle, rows, columns, counts, palette: &palette };
             draw_matrix(&matrix)?.write_png(path)
         })
+    }
+
+    /// Whether it was counted how often what the network was so sure of came true.
+    pub fn has_calibration(&self) -> bool {
+        self.header.what.calibration
+    }
+
+    /// Draws the reliability diagram of all voxels as a PNG: of "occupied" and of the class, or of two predictors of "occupied".
+    ///
+    /// # Errors
+    /// [`ErrorKind::Mismatch`](crate::ErrorKind::Mismatch) if calibration was not counted;
+    /// [`ErrorKind::Io`](crate::ErrorKind::Io) if it cannot be written.
+    pub fn write_reliability(&self, path: &Path) -> Result<()> {
+        if !self.has_calibration() {
+            let message = "nothing was counted of how sure the network was, expected an evaluation with calibration";
+            return Err(Error::mismatch(message).in_file(path));
+        }
+        let all: Vec<&Calibration> = self.total.scores.iter().filter_map(|score| score.calibration.first()).collect();
+        let named = match &all[..] {
+            [one] => vec![("occupied", &one.occupied), ("class", &one.class)],
+            several => ["A: occupied", "B: occupied"].into_iter().zip(several.iter().map(|c| &c.occupied)).collect(),
+        };
+        let curve = |(name, reliability): (&str, &Reliability)| {
+            let error = reliability.expected_error().map_or("-".to_owned(), |error| format!("{:.2} %", 100.0 * error));
+            let point = |Bin { voxels, said, found }: &Bin| Point {
+                said: *said as f32,
+                found: *found as f32,
+                share: *voxels as f32 / reliability.voxels() as f32,
+            };
+            Curve {
+                name: format!("{name}, calibration error {error}"),
+                points: reliability.bins().iter().map(point).collect(),
+            }
+        };
+        let curves: Vec<Curve> = named.into_iter().map(curve).collect();
+        let title = self.with(|reports, _| reports[0].title.to_owned());
+        let subtitle = format!("{} frames; 15 bins, the larger the more voxels", self.frames);
+        draw_diagram(&Diagram { title: &title, subtitle: &subtitle, curves: &curves }).write_png(path)
     }
 
     /// Calls `f` with the report of each predictor, and the comparison of two.

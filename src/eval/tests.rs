@@ -13,7 +13,7 @@ fn scorer(prediction: Grid) -> Scorer {
 }
 
 fn blind(classes: &[u8]) -> Prediction<'_> {
-    Prediction { classes, support: None, logits: None }
+    Prediction { classes, support: None, logits: None, confidence: None }
 }
 
 /// Classes 0 to 3 and ignored voxels, in no order.

@@ -12,7 +12,7 @@ use voxcast_kernels::Isa;
 /// Tensors that an operation reads beside its residual, at most.
 pub const MAX_INPUTS: usize = 2;
 /// Tensors that an operation writes, at most.
-pub const MAX_OUTPUTS: usize = 2;
+pub const MAX_OUTPUTS: usize = 4;
 
 /// The tensor that is added to the result.
 #[derive(Clone, Copy, Debug)]

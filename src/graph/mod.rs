@@ -25,6 +25,7 @@ mod recipe;
 mod rewrite;
 pub mod scale;
 mod site;
+pub mod temperature;
 mod tensor;
 #[cfg(test)]
 mod tests;
@@ -43,4 +44,5 @@ pub use recipe::{ConvNames, Recipe};
 pub(crate) use scale::LEVELS;
 pub use scale::Scale;
 pub use site::{Residual, Site};
+pub use temperature::Temperature;
 pub use tensor::{Branch, Lifetime, Scope, Section, Space, Tensor, TensorId};

@@ -1,5 +1,7 @@
 //! What can be asked of a graph.
 
+use super::temperature::Temperature;
+
 /// Which results a graph has beside the classes of level 0.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Results {
@@ -8,11 +10,13 @@ pub struct Results {
     /// The heads of levels 1 to 3, which training used and inference does not need, for observers. Then all heads give
     /// logits.
     pub coarse_heads: bool,
+    /// How sure level 0 is, by a softmax of this temperature.
+    pub confidence: Option<Temperature>,
 }
 
 impl Results {
-    /// Everything.
-    pub const ALL: Self = Self { logits: true, coarse_heads: true };
+    /// The results of every head: all that weights are stored for.
+    pub const ALL: Self = Self { logits: true, coarse_heads: true, confidence: None };
 }
 
 /// Which rewrites a graph gets.

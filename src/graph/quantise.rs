@@ -249,7 +249,8 @@ impl Graph {
             Op::Broadcast(_) => BroadcastI8.into(),
             Op::Head(head) => {
                 let [first, second] = hidden_layers(&operation.name);
-                HeadI8 { classes: head.classes, signed, hidden: [scale(&first)?, scale(&second)?] }.into()
+                let hidden = [scale(&first)?, scale(&second)?];
+                HeadI8 { classes: head.classes, signed, hidden, confidence: head.confidence }.into()
             }
             other => unreachable!("{other:?} stays in floating point"),
         })

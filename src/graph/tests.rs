@@ -122,7 +122,7 @@ fn every_rewrite_leaves_a_sound_graph() {
     for name in crate::network::BUILT_IN {
         let network = Network::built_in(name).expect("built in");
         for coarse in [false, true] {
-            let graph = Graph::build(&network, Results { logits: false, coarse_heads: coarse });
+            let graph = Graph::build(&network, Results { coarse_heads: coarse, ..Results::default() });
             let norms = |g: &Graph| g.operations.iter().filter(|o| o.op == Op::BatchNorm(BatchNorm)).count();
             assert_sound(&graph);
             assert!(norms(&graph) > 60, "{name}");

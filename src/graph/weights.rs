@@ -1,6 +1,7 @@
 //! From checkpoint to stored parts: norms folded in f64, weights packed as the kernels read them.
 
 use super::recipe::ConvNames;
+use super::temperature::Temperature;
 use crate::base::error::{Error, Result};
 use voxcast_kernels::LANES;
 use voxcast_kernels::panels::{packed_index, packed_len};
@@ -15,6 +16,11 @@ pub trait Source {
     /// # Errors
     /// Naming the tensor, if it is missing, has another shape or holds a number that is not finite.
     fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>>;
+
+    /// The temperature that was fitted to the network with these weights; 1 if none was.
+    fn temperature(&self) -> Temperature {
+        Temperature::ONE
+    }
 }
 
 /// The elements of one part, in f64. They are rounded once, to the type in which the part is stored.

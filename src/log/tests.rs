@@ -4,7 +4,7 @@ use super::schema::{self, Schema, descriptors};
 use super::*;
 use crate::base::error::{ErrorKind, Result};
 use crate::network::{Grid, Network};
-use crate::runtime::session::{CameraStatus, Occupancy};
+use crate::runtime::session::{CameraStatus, Confidence, Occupancy};
 use crate::scene::{Image, Scene};
 use crate::synth::Synthesiser;
 use mcap::records::MessageHeader;
@@ -139,7 +139,8 @@ fn written(scenes: &[(u64, [u64; 2], Scene)]) -> Vec<u8> {
         let classes: Vec<u8> = (0..voxels).map(|at| (at % 17) as u8).collect();
         let support = vec![3; voxels];
         let cameras = [CameraStatus::default(); 2];
-        let occupancy = Occupancy { grid, classes: &classes, logits: None, support: &support, cameras: &cameras };
+        let occupancy =
+            Occupancy { grid, classes: &classes, logits: None, confidence: None, support: &support, cameras: &cameras };
         let files: Vec<Encoded> = scene.images.iter().map(|image| Encoded::png(image).expect("a PNG")).collect();
         let shots: Vec<Shot<'_>> = (0..2)
             .map(|camera| Shot {
@@ -178,6 +179,45 @@ fn what_is_written_comes_back_bit_for_bit() {
         assert_eq!(frame.scene.lidar2img, scene.lidar2img);
         assert!(frame.scene == *scene);
         assert!(frame.files[0].as_ref().is_some_and(|file| file.format == "png"));
+    }
+}
+
+#[test]
+fn confidence_is_two_fields_more() {
+    use super::schema::VoxelGrid;
+    use prost::Message as _;
+    let network = network();
+    let grid = Grid::of(&network);
+    let voxels = grid.voxels();
+    let dir = tempfile::tempdir().expect("a directory");
+    let classes: Vec<u8> = (0..voxels).map(|at| (at % 17) as u8).collect();
+    let (occupied, class): (Vec<u8>, Vec<u8>) = (0..voxels).map(|at| (at as u8, (at * 7) as u8)).unzip();
+    let written = |confidence| {
+        let path = dir.path().join("out.mcap");
+        let occupancy =
+            Occupancy { grid, classes: &classes, logits: None, confidence, support: &vec![3; voxels], cameras: &[] };
+        let mut writer = LogWriter::create(&path, &network).expect("a log");
+        let latency = Duration::from_millis(5);
+        writer.push(&LogFrame { stamp: 7, shots: &[], occupancy, latency }).expect("written");
+        writer.finish().expect("written");
+        let bytes = std::fs::read(&path).expect("a log");
+        let messages = mcap::MessageStream::new(&bytes).expect("a log");
+        let message = messages.map(|m| m.expect("whole")).find(|m| m.channel.topic == "/voxcast/occupancy");
+        VoxelGrid::decode(&message.expect("voxels").data[..]).expect("a grid")
+    };
+    let (plain, sure) = (written(None), written(Some(Confidence { occupied: &occupied, class: &class })));
+    let fields = |grid: &VoxelGrid| grid.fields.iter().map(|f| (f.name.clone(), f.offset)).collect::<Vec<_>>();
+    let mut expected = fields(&plain);
+    expected.extend([("confidence_occupied".to_owned(), 8), ("confidence_class".to_owned(), 9)]);
+    assert_eq!((fields(&sure), plain.cell_stride, sure.cell_stride), (expected, 8, 10));
+    let [nx, ny, nz] = grid.size;
+    assert_eq!((sure.row_stride as usize, sure.slice_stride as usize), (10 * nx, 10 * nx * ny));
+    let cells = sure.data.chunks_exact(10).zip(plain.data.chunks_exact(8));
+    assert_eq!(cells.len(), voxels);
+    for (index, (sure, plain)) in cells.enumerate() {
+        let (x, y, z) = (index % nx, index / nx % ny, index / nx / ny);
+        let at = (x * ny + y) * nz + z;
+        assert!(sure[..8] == *plain && sure[8..] == [occupied[at], class[at]], "cell {index}");
     }
 }
 

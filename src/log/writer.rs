@@ -214,9 +214,9 @@ impl LogWriter {
     }
 
     fn voxels(&self, stamp: Stamp, occupancy: &Occupancy<'_>) -> Result<schema::VoxelGrid> {
-        const CELL: usize = 8;
+        let cell = if occupancy.confidence.is_some() { 10 } else { 8 };
         let [nx, ny, nz] = occupancy.grid.size;
-        let bytes = occupancy.classes.len().checked_mul(CELL).filter(|&bytes| u32::try_from(bytes).is_ok());
+        let bytes = occupancy.classes.len().checked_mul(cell).filter(|&bytes| u32::try_from(bytes).is_ok());
         let bytes = bytes.ok_or_else(|| Error::new(ErrorKind::TooLarge, "voxels of more than 4 GiB, expected less"))?;
         let mut data = Vec::with_capacity(bytes);
         for z in 0..nz {
@@ -227,6 +227,7 @@ impl LogWriter {
                     data.extend(self.colour(class));
                     data.extend([class, 0]);
                     data.extend(occupancy.support[at].to_le_bytes());
+                    data.extend(occupancy.confidence.iter().flat_map(|sure| [sure.occupied[at], sure.class[at]]));
                 }
             }
         }
@@ -238,10 +239,10 @@ impl LogWriter {
             row_count: ny as u32,
             column_count: nx as u32,
             cell_size: Some(Vector3 { x, y, z }),
-            slice_stride: (CELL * nx * ny) as u32,
-            row_stride: (CELL * nx) as u32,
-            cell_stride: CELL as u32,
-            fields: fields(&[]),
+            slice_stride: (cell * nx * ny) as u32,
+            row_stride: (cell * nx) as u32,
+            cell_stride: cell as u32,
+            fields: fields(if occupancy.confidence.is_some() { &CONFIDENCE } else { &[] }),
             data,
         })
     }
@@ -279,6 +280,10 @@ impl LogWriter {
         }
     }
 }
+
+/// How sure the network is of a voxel.
+const CONFIDENCE: [(&str, u32, i32); 2] =
+    [("confidence_occupied", 8, numeric::UINT8), ("confidence_class", 9, numeric::UINT8)];
 
 /// Colours, class and support of a cell, and what it has besides.
 fn fields(more: &[(&str, u32, i32)]) -> Vec<PackedElementField> {

@@ -2,7 +2,7 @@
 
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::graph::parts::{Part, Precision};
-use crate::graph::{Graph, Operation, Quantisation, Results, Rewrites, Scale};
+use crate::graph::{Graph, Operation, Quantisation, Results, Rewrites, Scale, Temperature};
 use crate::model::{FORMAT, Options};
 use crate::network::Network;
 use serde::de::DeserializeOwned;
@@ -16,6 +16,9 @@ const KEEP_F32: &str = "keep_f32";
 /// Metadata key of a model whose convolutions use Winograd's minimal filtering where shapes make it worth while.
 const WINOGRAD: &str = "winograd";
 
+/// Metadata key of a model whose temperature is not 1.
+pub(crate) const TEMPERATURE: &str = "temperature";
+
 /// Everything from which a model's graphs follow.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Form {
@@ -23,6 +26,8 @@ pub(crate) struct Form {
     pub(crate) options: Options,
     /// There if and only if the precision is int8.
     pub(crate) quantisation: Option<Quantisation>,
+    /// Of the softmax that says how sure it is.
+    pub(crate) temperature: Temperature,
 }
 
 impl Form {
@@ -35,7 +40,7 @@ impl Form {
             let message = "int8 needs the ranges of tensors, expected f32 or f16 where there are none";
             return Err(Error::new(ErrorKind::Unsupported, message));
         }
-        Self { network: network.clone(), options, quantisation: None }.checked()
+        Self { network: network.clone(), options, quantisation: None, temperature: Temperature::ONE }.checked()
     }
 
     /// That of a model in 8-bit integers.
@@ -44,7 +49,8 @@ impl Form {
     /// Rewrites that keep batch norms, and whatever [`Graph::quantise`] refuses.
     pub(crate) fn integers(network: &Network, rewrites: Rewrites, quantisation: Quantisation) -> Result<Self> {
         let options = Options { precision: Precision::I8, rewrites: Rewrites { winograd: false, ..rewrites } };
-        Self { network: network.clone(), options, quantisation: Some(quantisation) }.checked()
+        let (network, quantisation) = (network.clone(), Some(quantisation));
+        Self { network, options, quantisation, temperature: Temperature::ONE }.checked()
     }
 
     fn checked(self) -> Result<Self> {
@@ -96,7 +102,13 @@ impl Form {
                 Some(Quantisation { keep_f32: json(KEEP_F32, get(KEEP_F32)?)?, scales: json(SCALES, get(SCALES)?)? })
             }
         };
-        let form = Self { network, options: Options { precision, rewrites }, quantisation };
+        let temperature = match metadata.get(TEMPERATURE) {
+            None => Temperature::ONE,
+            Some(text) => text
+                .parse()
+                .map_err(|e: Error| Error::format(format!("metadata key \"{TEMPERATURE}\": {}", e.message())))?,
+        };
+        let form = Self { network, options: Options { precision, rewrites }, quantisation, temperature };
         form.graph(false, Results::ALL).map_err(|e| Error::format(e.message().to_owned()))?;
         Ok(form)
     }
@@ -118,6 +130,9 @@ impl Form {
         if let Some(Quantisation { keep_f32, scales }) = &self.quantisation {
             metadata.insert(KEEP_F32.to_owned(), serde_json::to_string(keep_f32).unwrap_or_default());
             metadata.insert(SCALES.to_owned(), serde_json::to_string(scales).unwrap_or_default());
+        }
+        if self.temperature != Temperature::ONE {
+            metadata.insert(TEMPERATURE.to_owned(), self.temperature.to_string());
         }
         metadata
     }

@@ -184,6 +184,7 @@ struct Conversion<'a> {
 
 impl<'a> Conversion<'a> {
     fn new(source: &'a dyn Source, form: Form) -> Result<Self> {
+        let form = Form { temperature: source.temperature(), ..form };
         let graphs = form.graphs()?;
         let operations = model::stored(&graphs);
         Ok(Self { source, form, graphs, operations, current: RefCell::new((usize::MAX, vec![])) })

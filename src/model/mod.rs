@@ -18,7 +18,7 @@ pub use transform::use_winograd;
 use crate::base::error::{Error, Result};
 use crate::file::container::{Container, Data, Layout, Tensor};
 use crate::graph::parts::{Part, Precision};
-use crate::graph::{Element, Elements, Graph, Operation, Quantisation, Results, Rewrites};
+use crate::graph::{Element, Elements, Graph, Operation, Quantisation, Results, Rewrites, Temperature};
 pub(crate) use crate::model::form::{Form, parts, quantisation, stored};
 use crate::model::selftest::SelfTest;
 use crate::network::Network;
@@ -153,16 +153,43 @@ impl Model {
         self.path.as_deref()
     }
 
+    /// The temperature of the softmax that says how sure the network is ([`Occupancy::confidence`]): 1 unless one was
+    /// fitted.
+    ///
+    /// [`Occupancy::confidence`]: crate::Occupancy::confidence
+    pub fn temperature(&self) -> Temperature {
+        self.form.temperature
+    }
+
     /// Writes the model to `path`, as it is, by way of a temporary file beside it.
     ///
     /// # Errors
     /// [`ErrorKind::Io`](crate::ErrorKind::Io) if the system refuses.
     pub fn save(&self, path: &Path) -> Result<()> {
+        self.save_with(path, self.metadata())
+    }
+
+    /// [`Model::save`] with another temperature. Weights and self-test stay as they are: a temperature changes neither classes
+    /// nor logits.
+    ///
+    /// # Errors
+    /// As [`Model::save`].
+    pub fn save_with_temperature(&self, temperature: Temperature, path: &Path) -> Result<()> {
+        let mut metadata = self.metadata().clone();
+        match temperature == Temperature::ONE {
+            true => metadata.remove(form::TEMPERATURE),
+            false => metadata.insert(form::TEMPERATURE.to_owned(), temperature.to_string()),
+        };
+        self.save_with(path, &metadata)
+    }
+
+    /// Writes the model with this metadata.
+    pub(crate) fn save_with(&self, path: &Path, metadata: &BTreeMap<String, String>) -> Result<()> {
         let tensors = self.contents().map(|(name, dtype, shape, bytes)| {
             let shape = shape.to_vec();
             Tensor { name, dtype, shape, data: Data::Bytes(bytes) }
         });
-        crate::file::container::write(path, tensors.collect(), self.metadata(), LAYOUT)
+        crate::file::container::write(path, tensors.collect(), metadata, LAYOUT)
     }
 
     /// The bytes of the file.

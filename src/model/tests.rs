@@ -365,3 +365,33 @@ fn stored_sizes_of_known_operations() {
     // 17 classes fill two panels.
     assert_eq!(lens("occ_head.mlp_occ_lvl0"), [32 * 32, 32, 32 * 32, 32, 32 * 32, 32]);
 }
+
+#[test]
+fn a_temperature_is_kept_and_a_wrong_one_refused() {
+    use crate::graph::Temperature;
+    let directory = tempfile::tempdir().expect("a place");
+    let path = directory.path().join("model");
+    let rewrites = Rewrites { winograd: false, ..Rewrites::ALL };
+    let model = Model::from_bytes(sound(Options { rewrites, ..Options::default() })).expect("sound");
+    assert_eq!(model.temperature(), Temperature::ONE);
+    let warm: Temperature = "1.375".parse().expect("a temperature");
+    model.save_with_temperature(warm, &path).expect("written");
+    let found = Model::open(&path).expect("sound");
+    assert_eq!(found.temperature(), warm);
+    assert_ne!(found.checksum(), model.checksum(), "evaluations tell them apart");
+    // A model that is made of it has it too.
+    let source = unpacked::Unpacked::new(&found).expect("floating point");
+    let half = Options { precision: Precision::F16, ..Options::default() };
+    let bytes = import::import_to_bytes(&source, found.network(), half, &mut |_, _| ()).expect("a model");
+    assert_eq!(Model::from_bytes(bytes).expect("sound").temperature(), warm);
+    // One is no key at all: the same bytes as before.
+    found.save_with_temperature(Temperature::ONE, &path).expect("written");
+    assert_eq!(std::fs::read(&path).expect("a file"), model.bytes());
+    for (text, expected) in [("warm", "expected a number"), ("0", "temperature 0e0"), ("-1", "expected a positive")] {
+        let wrong = |_: &mut Vec<Loose>, metadata: &mut BTreeMap<String, String>| {
+            metadata.insert("temperature".to_owned(), text.to_owned());
+        };
+        refused(wrong, "metadata key \"temperature\"");
+        refused(wrong, expected);
+    }
+}

@@ -26,7 +26,7 @@ pub fn use_winograd(model: &Model, path: &Path, progress: &mut dyn FnMut(usize, 
         return Err(Error::new(ErrorKind::Unsupported, "the model uses Winograd's minimal filtering already"));
     }
     let options = Options { precision, rewrites: Rewrites { winograd: true, ..rewrites } };
-    let form = Form::floating(model.network(), options)?;
+    let form = Form { temperature: model.temperature(), ..Form::floating(model.network(), options)? };
     let graphs = form.graphs()?;
     let operations = stored(&graphs).into_iter().map(|(g, o)| (&graphs[g], &graphs[g].operations[o]));
     let operations: Vec<_> = operations.map(|(graph, operation)| (operation, parts(graph, operation))).collect();

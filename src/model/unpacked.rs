@@ -6,7 +6,7 @@
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::graph::parts::Precision;
 use crate::graph::weights::{EPSILON, Source, Values, Weights};
-use crate::graph::{Element, Graph};
+use crate::graph::{Element, Graph, Temperature};
 use crate::model::Model;
 use std::cell::RefCell;
 use std::collections::{BTreeMap, BTreeSet};
@@ -150,6 +150,10 @@ impl<'a> Unpacked<'a> {
 }
 
 impl Source for Unpacked<'_> {
+    fn temperature(&self) -> Temperature {
+        self.model.temperature()
+    }
+
     fn tensor(&self, name: &str, shape: &[usize]) -> Result<Vec<f64>> {
         let Some((index, found)) = self.readers.get(name) else {
             return Err(Error::format(format!("tensor \"{name}\" is missing, expected shape {shape:?}")));

@@ -12,7 +12,7 @@ pub use camera::CameraStatus;
 pub use frame::{Budget, Step};
 pub use memory::Memory;
 pub use moving::Moving;
-pub use output::{Occupancy, OwnedOccupancy};
+pub use output::{Confidence, Occupancy, OwnedOccupancy};
 
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::base::threads::Threads;
@@ -44,6 +44,8 @@ pub struct SessionOptions {
     pub unfolded: bool,
     /// Also keep the logits of level 0.
     pub logits: bool,
+    /// Also keep how sure the network is of every voxel.
+    pub confidence: bool,
     /// Also run the heads of levels 1 to 3, for whoever observes their stages.
     pub coarse_heads: bool,
     /// Work in one slice of [`Session::step`], in multiply-adds; a number that moves counts as 20. A slice is at least one
@@ -58,6 +60,7 @@ impl Default for SessionOptions {
             threads: Threads::calling(),
             unfolded: false,
             logits: false,
+            confidence: false,
             coarse_heads: false,
             slice_cost: 50_000_000,
         }
@@ -206,6 +209,12 @@ impl Session {
     #[cfg(feature = "capi")]
     pub(crate) fn keeps_logits(&self) -> bool {
         self.front.has_logits()
+    }
+
+    /// Whether results say how sure the network is.
+    #[cfg(feature = "capi")]
+    pub(crate) fn keeps_confidence(&self) -> bool {
+        self.front.has_confidence()
     }
 
     /// Cameras of a frame.

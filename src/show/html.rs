@@ -47,7 +47,8 @@ pub struct Page<'a> {
     pub title: &'a str,
     /// Second line, such as the model's name; may be empty.
     pub subtitle: &'a str,
-    /// What was predicted; its support tells "free" and "unknown" apart. Its caption names it, "prediction" if empty.
+    /// What was predicted; its support tells "free" and "unknown" apart, and its confidence gives a
+    /// slider that hides what is less likely to be there. Its caption names it, "prediction" if empty.
     pub prediction: Occupancy<'a>,
     /// The class of every voxel in truth, z fastest, on the grid of the prediction; 255 marks voxels without a label.
     pub truth: Option<&'a [u8]>,
@@ -72,6 +73,8 @@ struct Data<'a> {
     truth: Option<Layer<'a>>,
     /// u16 per voxel.
     support: Option<String>,
+    /// u8 per voxel: the probability that it is occupied.
+    confidence: Option<String>,
     cameras: Vec<PageCamera<'a>>,
 }
 
@@ -131,7 +134,7 @@ impl Page<'_> {
             "" => "prediction",
             caption => caption,
         };
-        let support = self.prediction.support;
+        let (support, confidence) = (self.prediction.support, self.prediction.confidence);
         let data = Data {
             title: self.title,
             subtitle: self.subtitle,
@@ -147,6 +150,7 @@ impl Page<'_> {
                 let bytes: Vec<u8> = support.iter().flat_map(|n| n.to_le_bytes()).collect();
                 packed(&bytes)
             }),
+            confidence: (!confidence.is_empty()).then(|| packed(confidence)),
             cameras: self.scene.map_or(Ok(Vec::new()), cameras)?,
         };
         let json = serde_json::to_string(&data).unwrap_or_default();

@@ -80,8 +80,8 @@ int __wrap_posix_memalign(void **place, size_t alignment, size_t size)
 
 /* The arguments, and what was made of them. */
 static const char *model_path, *rig_path, *faulty_path, *mute_path;
-/* Bytes of a session with default options, and of one with logits, as the library says in Rust. */
-static uint64_t memory_without_logits, memory_with_logits;
+/* Bytes of a session with default options, of one with logits, and of one with confidence, as the library says in Rust. */
+static uint64_t memory_of_classes, memory_with_logits, memory_with_confidence;
 static voxcast_image images[CAMERAS];
 static float matrices[CAMERAS * 16];
 static voxcast_model *model;
@@ -230,10 +230,21 @@ static void options_that_cannot_be(const voxcast_rig *rig)
     RETURNS(VOXCAST_INVALID_ARGUMENT, voxcast_session_memory(model, CAMERAS, NULL, NULL, SAID));
     uint64_t bytes;
     RETURNS(VOXCAST_OK, voxcast_session_memory(model, CAMERAS, NULL, &bytes, SAID));
-    CHECK(bytes == memory_without_logits);
+    CHECK(bytes == memory_of_classes);
     options = (voxcast_options) { .size = sizeof options, .logits = 1 };
     RETURNS(VOXCAST_OK, voxcast_session_memory(model, CAMERAS, &options, &bytes, SAID));
     CHECK(bytes == memory_with_logits);
+    options = (voxcast_options) { .size = sizeof options, .confidence = 1 };
+    RETURNS(VOXCAST_OK, voxcast_session_memory(model, CAMERAS, &options, &bytes, SAID));
+    /* Two results, of two bytes more for each voxel. */
+    CHECK(bytes == memory_with_confidence && bytes > memory_of_classes + 4 * network.voxels);
+    options.reserved = 1;
+    RETURNS(VOXCAST_INVALID_ARGUMENT, voxcast_session_memory(model, CAMERAS, &options, &bytes, SAID));
+    options.reserved = 0;
+    /* A program that was compiled when the struct was shorter. */
+    options.size = offsetof(voxcast_options, confidence);
+    RETURNS(VOXCAST_OK, voxcast_session_memory(model, CAMERAS, &options, &bytes, SAID));
+    CHECK(bytes == memory_of_classes);
     RETURNS(VOXCAST_TOO_LARGE, voxcast_session_memory(model, SIZE_MAX / 2, &options, &bytes, SAID));
 }
 
@@ -278,6 +289,10 @@ static void before_the_first_frame(voxcast_session *session)
     CHECK(length == network.voxels);
     RETURNS(VOXCAST_OK, voxcast_session_logits(session, NULL, 0, &length, SAID));
     CHECK(length == network.voxels * network.classes);
+    RETURNS(VOXCAST_OK, voxcast_session_confidence_occupied(session, NULL, 0, &length, SAID));
+    CHECK(length == network.voxels);
+    RETURNS(VOXCAST_BUFFER_TOO_SMALL, voxcast_session_confidence_class(session, &byte, 1, &length, SAID));
+    CHECK(length == network.voxels && byte == 7);
     RETURNS(VOXCAST_OK, voxcast_session_cameras(session, NULL, 0, &length, SAID));
     CHECK(length == CAMERAS);
     voxcast_camera cameras[CAMERAS];
@@ -344,12 +359,12 @@ static void other_ways(voxcast_session *session, uint64_t expected)
     RETURNS(VOXCAST_OK, voxcast_session_longest_slice(session, &longest, NULL, 0, SAID));
 }
 
-/* Classes, logits, bits and support agree with each other. */
+/* Classes, logits, confidence, bits and support agree with each other. */
 static void results(voxcast_session *session)
 {
     const size_t voxels = network.voxels, count = voxels * network.classes;
     size_t length, occupied = 0, unseen = 0;
-    uint8_t *classes = malloc(voxels), *bits = malloc(voxels);
+    uint8_t *classes = malloc(voxels), *bits = malloc(voxels), *sure = malloc(voxels), *filled = malloc(voxels);
     uint16_t *support = malloc(voxels * sizeof *support);
     float *logits = malloc(count * sizeof *logits);
     RETURNS(VOXCAST_OK, voxcast_session_classes(session, classes, voxels, &length, SAID));
@@ -357,12 +372,18 @@ static void results(voxcast_session *session)
     RETURNS(VOXCAST_OK, voxcast_session_support(session, support, voxels, &length, SAID));
     CHECK(length == voxels);
     RETURNS(VOXCAST_OK, voxcast_session_bits(session, bits, voxels, &length, SAID));
+    RETURNS(VOXCAST_OK, voxcast_session_confidence_occupied(session, filled, voxels, &length, SAID));
+    RETURNS(VOXCAST_OK, voxcast_session_confidence_class(session, sure, voxels, NULL, SAID));
+    CHECK(length == voxels);
     for (size_t v = 0; v < voxels; v++) {
         size_t best = 0;
         for (size_t k = 1; k < network.classes; k++)
             if (logits[v * network.classes + k] > logits[v * network.classes + best])
                 best = k;
         CHECK(classes[v] == best && (bits[v / 8] >> v % 8 & 1) == (best != 0));
+        /* Of an empty voxel the two probabilities are all; else that of its class is a part of "occupied". */
+        CHECK(best == 0 ? abs(sure[v] + filled[v] - 255) <= 1 : sure[v] <= filled[v] + 1);
+        CHECK(sure[v] * network.classes >= 255 - network.classes);
         occupied += best != 0;
         unseen += support[v] == 0;
     }
@@ -374,6 +395,8 @@ static void results(voxcast_session *session)
     RETURNS(VOXCAST_INVALID_ARGUMENT, voxcast_session_classes(session, classes, SIZE_MAX, &length, SAID));
     free(classes);
     free(bits);
+    free(sure);
+    free(filled);
     free(support);
     free(logits);
 }
@@ -498,14 +521,15 @@ static void several_threads(voxcast_session *session, uint64_t expected)
 
 int main(int argc, char **argv)
 {
-    if (argc != 11)
+    if (argc != 12)
         return 2;
     model_path = argv[1];
     rig_path = argv[2];
     faulty_path = argv[7];
     mute_path = argv[8];
-    memory_without_logits = strtoull(argv[9], NULL, 10);
+    memory_of_classes = strtoull(argv[9], NULL, 10);
     memory_with_logits = strtoull(argv[10], NULL, 10);
+    memory_with_confidence = strtoull(argv[11], NULL, 10);
     size_t length;
     uint8_t *pixels = read_file(argv[3], &length), *bytes;
     const size_t height = strtoul(argv[4], NULL, 10), width = strtoul(argv[5], NULL, 10), image = 3 * height * width;
@@ -527,12 +551,16 @@ int main(int argc, char **argv)
     voxcast_rig *rig;
     RETURNS(VOXCAST_OK, voxcast_rig_open(model, rig_path, CAMERAS, &rig, SAID));
     options_that_cannot_be(rig);
-    const voxcast_options options = { .size = sizeof options, .threads = 2, .logits = 1, .slice_cost = 300000 };
+    const voxcast_options options = {
+        .size = sizeof options, .threads = 2, .logits = 1, .slice_cost = 300000, .confidence = 1,
+    };
     voxcast_session *session, *plain;
     RETURNS(VOXCAST_OK, voxcast_session_new(model, rig, &options, &session, SAID));
     const voxcast_options scalar = { .size = sizeof scalar, .isa = "scalar" };
     RETURNS(VOXCAST_OK, voxcast_session_new(model, rig, &scalar, &plain, SAID));
     RETURNS(VOXCAST_UNSUPPORTED, voxcast_session_logits(plain, NULL, 0, &length, SAID));
+    RETURNS(VOXCAST_UNSUPPORTED, voxcast_session_confidence_occupied(plain, NULL, 0, &length, SAID));
+    RETURNS(VOXCAST_UNSUPPORTED, voxcast_session_confidence_class(plain, NULL, 0, &length, SAID));
     RETURNS(VOXCAST_OK, voxcast_session_run(plain, images, CAMERAS, SAID));
     const uint64_t specified = digest_of(plain);
     uint64_t of_logits;

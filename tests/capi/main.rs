@@ -28,8 +28,8 @@ struct Files {
     directory: tempfile::TempDir,
     images: Vec<PathBuf>,
     size: [usize; 2],
-    /// Bytes of a session without logits, and of one that keeps them.
-    memory: [usize; 2],
+    /// Bytes of a session with classes alone, of one that keeps logits, and of one that says how sure it is.
+    memory: [usize; 3],
     digest: String,
     logits_digest: String,
 }
@@ -54,7 +54,8 @@ impl Files {
         std::fs::write(path("matrices"), matrices).unwrap();
         std::fs::write(path("images"), images.iter().flat_map(|i| i.pixels).copied().collect::<Vec<u8>>()).unwrap();
         let options = SessionOptions { logits: true, ..SessionOptions::default() };
-        let memory = [&SessionOptions::default(), &options]
+        let sure = SessionOptions { confidence: true, ..SessionOptions::default() };
+        let memory = [&SessionOptions::default(), &options, &sure]
             .map(|options| Session::memory(&model, network.cameras, options).unwrap().total());
         let mut session = Session::new(model, rig, &options).unwrap();
         let result = session.run(&images).unwrap();
@@ -206,7 +207,7 @@ macro_rules! layout {
 fn structs_lie_as_in_c() {
     let expected = [
         layout!("voxcast_network", Network, [size, cameras, classes, height, width, grid, voxels, bounds, checksum]),
-        layout!("voxcast_options", Options, [size, isa, threads, logits, slice_cost]),
+        layout!("voxcast_options", Options, [size, isa, threads, logits, slice_cost, confidence, reserved]),
         layout!("voxcast_image", Image, [pixels, length, height, width, stride, order, reserved]),
         layout!("voxcast_camera", Camera, [image, age, masked, reserved]),
     ];

@@ -251,3 +251,86 @@ fn two_models_are_compared() {
     assert_eq!(&fs::read(place.path("confusion.png")).unwrap()[..4], b"\x89PNG");
     assert_eq!(voxcast(&["eval", "--compare", &model, "--data", &data]).status.code(), Some(2));
 }
+
+#[test]
+fn confidence_is_fitted_and_its_calibration_counted() {
+    let place = Place(tempfile::tempdir().unwrap());
+    let [model, data] = street_set(&place);
+    let [json, picture, fitted] = ["scores.json", "reliability.png", "fitted"].map(|f| place.text(f));
+    let read = || serde_json::from_slice::<Value>(&fs::read(&json).unwrap()).unwrap();
+    let base = ["eval", "--model", &model, "--data", &data, "--json", &json];
+    let plain = done(&base);
+    assert!(read()["calibration"].is_null());
+    let told = done(&[&base[..], &["--calibration", "--reliability", &picture]].concat());
+    let [first, second] = ["calibration error ", "occupied from "].map(|head| told.find(head).unwrap());
+    assert!(told.starts_with(&plain) && plain.len() < first && first < second, "{told}");
+    let scores = read();
+    for region in ["all", "visible", "supported"] {
+        let counts = &scores["calibration"][region]["occupied"]["counts"];
+        let voxels: u64 = counts
+            .as_array()
+            .unwrap()
+            .iter()
+            .flat_map(|pair| pair.as_array().unwrap())
+            .map(|n| n.as_u64().unwrap())
+            .sum();
+        assert_eq!(Some(voxels), scores["regions"][region]["voxels"].as_u64(), "{region}");
+    }
+    let all = &scores["calibration"]["all"]["occupied"];
+    let thresholds = all["thresholds"].as_array().unwrap();
+    let recall: Vec<f64> = thresholds.iter().map(|row| row["recall"].as_f64().unwrap()).collect();
+    assert!(recall.is_sorted_by(|a, b| a >= b) && recall[0] > recall[18], "{recall:?}");
+    assert!((0.0..1.0).contains(&all["expected_error"].as_f64().unwrap()));
+    assert_eq!(&fs::read(&picture).unwrap()[..4], b"\x89PNG");
+
+    // Shards give the same, and know whether they have it.
+    let (whole, drawn) = (fs::read(&json).unwrap(), fs::read(&picture).unwrap());
+    let journals = ["0.jsonl", "1.jsonl"].map(|f| place.text(f));
+    for (index, journal) in journals.iter().enumerate() {
+        let part = format!("{index}/2");
+        done(&["eval", "--model", &model, "--data", &data, "--calibration", "--shard", &part, "--resume", journal]);
+    }
+    let merge = ["eval", "--merge", &journals[0], &journals[1], "--json", &json, "--reliability", &picture];
+    assert_eq!(done(&merge), told);
+    assert!(fs::read(&json).unwrap() == whole && fs::read(&picture).unwrap() == drawn);
+    let without = place.text("without.jsonl");
+    done(&["eval", "--model", &model, "--data", &data, "--limit", "1", "--resume", &without]);
+    let line = refused("reliability.png", &["eval", "--merge", &without, "--limit", "1", "--reliability", &picture]);
+    assert!(line.contains("expected an evaluation with calibration"), "{line}");
+
+    let fit = |from: &str, threads: &str| {
+        done(&["calibrate-confidence", from, "--data", &data, "-o", &fitted, "--threads", threads])
+    };
+    let told = fit(&model, "1");
+    assert!(told.contains("(before 1)") && told.contains("in 4 frames"), "{told}");
+    let bytes = fs::read(&fitted).unwrap();
+    fit(&model, "3");
+    assert!(fs::read(&fitted).unwrap() == bytes, "the same on any number of threads");
+    let inspected: Value = serde_json::from_str(&done(&["inspect", &fitted, "--json"])).unwrap();
+    let temperature = inspected["temperature"].as_f64().unwrap();
+    assert!((0.01..100.0).contains(&temperature) && temperature != 1.0, "{temperature}");
+    // In its own place, and no other than before.
+    assert!(fit(&fitted, "2").contains(&format!("(before {temperature})")));
+    assert!(fs::read(&fitted).unwrap() == bytes);
+    done(&["eval", "--model", &fitted, "--data", &data, "--json", &json, "--calibration"]);
+    let after = read();
+    assert_eq!(after["digest"], scores["digest"], "classes stay as they are");
+    assert_ne!(after["calibration"]["all"]["occupied"]["counts"], all["counts"]);
+    refused("no/fitted", &["calibrate-confidence", &model, "--data", &data, "-o", &place.text("no/fitted")]);
+}
+
+#[test]
+fn a_submission_goes_on_from_nothing() {
+    let place = Place(tempfile::tempdir().unwrap());
+    let [journal, file] = ["scores.jsonl", "submission.gz"].map(|f| place.text(f));
+    // Neither model nor data are looked at before that is said.
+    let base = ["eval", "--model", "no model", "--data", "openocc:none:none", "--submission", &file];
+    for more in [&["--resume", &journal][..], &["--resume", &journal, "--shard", "0/2"], &["--calibration"]] {
+        let output = voxcast(&[&base[..], more].concat());
+        let said = text(&output.stderr);
+        let first = said.lines().next().unwrap_or_default();
+        assert_eq!(output.status.code(), Some(2), "{more:?}: {said}");
+        assert!(first.contains("'--submission <FILE.gz>' cannot be used with") && first.contains(more[0]), "{first}");
+    }
+    assert!(!place.path("scores.jsonl").exists() && !place.path("submission.gz").exists());
+}

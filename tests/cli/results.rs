@@ -46,6 +46,28 @@ fn the_whole_path() {
         }
     };
     let all = support(&out);
+    let digest = run(&["--confidence"])["digest"].clone();
+    assert_eq!(digest, summary["digest"]);
+    let sure = read_npz(Path::new(&out)).unwrap();
+    let names: Vec<&str> = sure.iter().map(|array| array.name.as_str()).collect();
+    assert_eq!(names, ["classes", "confidence_occupied", "confidence_class", "support", "bounds", "colours"]);
+    let [OwnedElements::U8(occupied), OwnedElements::U8(class)] = [&sure[1].elements, &sure[2].elements] else {
+        panic!("confidences are bytes")
+    };
+    for ((&voxel, &occupied), &class) in classes.iter().zip(occupied).zip(class) {
+        assert!(if voxel == 0 { occupied.abs_diff(255 - class) < 2 } else { class <= occupied.saturating_add(1) });
+    }
+    let sure_page = place.text("sure.html");
+    done(&["view", &out, "-o", &sure_page]);
+    assert!(page(&sure_page)["confidence"].is_string());
+    let picture = |more: &[&str]| {
+        let png = place.text("sure.png");
+        run(&[&["--png", &png], more].concat());
+        fs::read(png).unwrap()
+    };
+    let (full, none) = (picture(&[]), picture(&["--hide-below", "1"]));
+    assert!(full != none && picture(&["--hide-below", "0"]) == full);
+    assert_eq!(voxcast(&["run", "--model", &model, &scene, "-o", &out, "--hide-below", "1.5"]).status.code(), Some(2));
     assert!(all.contains(&0) && all.iter().any(|&n| n > 1), "seen and unseen places");
     let masked = run(&["--mask", "1"]);
     assert_ne!(masked["digest"], summary["digest"]);

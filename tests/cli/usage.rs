@@ -6,9 +6,20 @@ use super::*;
 fn help_and_usage() {
     assert!(done(&["--version"]).starts_with("voxcast "));
     let help = done(&["--help"]);
-    for command in
-        ["compare", "demo", "eval", "import", "inspect", "profile", "rig", "run", "selftest", "synth", "view"]
-    {
+    for command in [
+        "calibrate-confidence",
+        "compare",
+        "demo",
+        "eval",
+        "import",
+        "inspect",
+        "profile",
+        "rig",
+        "run",
+        "selftest",
+        "synth",
+        "view",
+    ] {
         assert!(help.contains(command));
         assert!(done(&[command, "--help"]).contains("Examples:"), "{command}");
         assert!(done(&["help", command]).contains("Usage:"), "{command}");

@@ -70,6 +70,7 @@ fn logs() -> Vec<(String, Vec<u8>)> {
     let mut log = LogWriter::create(&path, &network).expect("a log");
     let (classes, support) = ([1; 512], [1; 512]);
     let occupancy = voxcast::Occupancy {
+        confidence: None,
         grid: voxcast::network::Grid::of(&network),
         classes: &classes,
         logits: None,

@@ -8,14 +8,14 @@
 //!
 //! All classes share one scale, so the largest sum is the largest logit; a logit is the nearest f32 to the sum, multiplied once.
 //! Each layer is a product of [`crate::product::int8`]. A block of voxels goes through all three while it is in the cache.
-//! Channels are a multiple of 4.
+//! Channels are a multiple of 4. Beside the classes, logits can be kept, and [how sure](crate::head::Confidence) the head is.
 
 use crate::isa::Isa;
 use crate::matmul::driver::Linear;
 use crate::matmul::int8::{self, Narrow, Raw};
 use crate::matmul::product::Multiply;
 use crate::matmul::{BLOCK_ROWS, ProductI8, ResidualI8};
-use crate::ops::head::{Rows, largest};
+use crate::ops::head::{Confidence, Results, Rows, largest};
 use crate::simd::{Kernel, LANES, Simd, dispatch};
 use core::ops::Range;
 
@@ -66,34 +66,22 @@ const fn hidden_len(channels: usize) -> usize {
     channels.div_ceil(size_of::<i32>())
 }
 
-/// Classifies the voxels `rows` into `classes_out`, one byte each; `logits_out`, if given, takes their logits.
+/// Classifies the voxels `rows` into `results`.
 ///
 /// # Panics
-/// If a slice does not have the size that the shapes ask for, or the channels are no multiple of 4; `scratch` needs
-/// [`scratch_len`] values of any value.
+/// If a slice does not have the size that the shapes ask for, or the channels are no multiple of 4; those of
+/// [`Confidence`]. `scratch` needs [`scratch_len`] values of any value.
 ///
 /// # Determinism
 /// The same bits on every instruction set and for every division into rows.
-pub fn head_i8(
-    isa: Isa,
-    args: &HeadI8<'_>,
-    rows: Range<usize>,
-    classes_out: &mut [u8],
-    logits_out: Option<&mut [f32]>,
-    scratch: &mut [i32],
-) {
-    assert!((1..=256).contains(&args.classes), "a class must fit a byte");
+pub fn head_i8(isa: Isa, args: &HeadI8<'_>, rows: Range<usize>, results: Results<'_>, scratch: &mut [i32]) {
+    results.check(rows.len(), args.classes);
     assert!(scratch.len() >= scratch_len(args.channels, args.classes), "the scratch is too small");
     (0..2).for_each(|layer| args.layer(layer).to::<Narrow>().check(rows.len(), scratch));
     args.layer(2).to::<Raw>().check(rows.len(), scratch);
     let held = rows.end.checked_mul(args.channels).is_some_and(|n| n <= args.input.len());
     assert!(rows.start <= rows.end && held, "rows {rows:?} are not in the input");
-    assert_eq!(classes_out.len(), rows.len(), "the classes do not hold the rows");
-    assert!(
-        logits_out.as_ref().is_none_or(|l| l.len() == rows.len() * args.classes),
-        "the logits do not hold the rows"
-    );
-    dispatch(isa, Run { args, rows, classes_out, logits_out, scratch });
+    dispatch(isa, Run { args, rows, results, scratch });
 }
 
 impl<'a> HeadI8<'a> {
@@ -118,8 +106,7 @@ impl<'a> HeadI8<'a> {
 struct Run<'a> {
     args: &'a HeadI8<'a>,
     rows: Range<usize>,
-    classes_out: &'a mut [u8],
-    logits_out: Option<&'a mut [f32]>,
+    results: Results<'a>,
     scratch: &'a mut [i32],
 }
 
@@ -133,9 +120,15 @@ struct Room<'a> {
 
 impl Run<'_> {
     /// Calls `block` with the first voxel and count of each block of rows and with room for it; then keeps the classes, and
-    /// has `logits` made of the sums if they are asked for.
+    /// has `logits` made of the sums if they are asked for. `sure` writes how sure the head is of a block, of its sums and
+    /// classes.
     #[inline(always)]
-    fn blocks(mut self, mut block: impl FnMut(usize, usize, &mut Room<'_>), logits: impl Fn(&[i32], &mut [f32])) {
+    fn blocks(
+        mut self,
+        mut block: impl FnMut(usize, usize, &mut Room<'_>),
+        logits: impl Fn(&[i32], &mut [f32]),
+        sure: impl Fn(&[i32], &[u8], Confidence<'_>),
+    ) {
         let HeadI8 { channels, classes, .. } = *self.args;
         let (product, rest) = self.scratch.split_at_mut(product_len(channels, classes));
         let (a, rest) = rest.split_at_mut(BLOCK_ROWS * hidden_len(channels));
@@ -147,11 +140,15 @@ impl Run<'_> {
             block(first, count, &mut room);
             let at = first - self.rows.start;
             let sums = &room.sums[..count * classes];
-            for (class, sums) in self.classes_out[at..at + count].iter_mut().zip(sums.chunks_exact(classes)) {
+            let chosen = &mut self.results.classes[at..at + count];
+            for (class, sums) in chosen.iter_mut().zip(sums.chunks_exact(classes)) {
                 *class = largest(sums);
             }
-            if let Some(out) = &mut self.logits_out {
+            if let Some(out) = &mut self.results.logits {
                 logits(sums, &mut out[at * classes..(at + count) * classes]);
+            }
+            if let Some(confidence) = &mut self.results.confidence {
+                sure(sums, chosen, confidence.part(at..at + count));
             }
         }
     }
@@ -181,6 +178,9 @@ impl Kernel for Run<'_> {
                     *out = *sum as f32 * scale;
                 }
             },
+            |sums, chosen, confidence| {
+                confidence.reference(classes, chosen, |voxel, k| sums[voxel * classes + k] as f32 * scale);
+            },
         );
     }
 
@@ -205,6 +205,16 @@ impl Kernel for Run<'_> {
                 for (sums, out) in sums.chunks(LANES).zip(out.chunks_mut(LANES)) {
                     s.store_part(out, s.mul(s.to_float(s.load_int_part(sums)), scale));
                 }
+            },
+            #[inline(always)]
+            |sums, chosen, confidence| {
+                confidence.run(
+                    s,
+                    classes,
+                    chosen,
+                    #[inline(always)]
+                    |voxel, k| sums[voxel * classes + k] as f32 * scale,
+                );
             },
         );
     }

@@ -1,6 +1,8 @@
 use super::*;
+use crate::file::container::{self, Data, Tensor};
 use crate::graph::Rewrites;
 use crate::graph::parts::Precision;
+use crate::model;
 use crate::small;
 
 fn recorded(precision: Precision) -> (tempfile::TempDir, std::path::PathBuf) {
@@ -97,13 +99,7 @@ fn a_model_without_or_with_a_malformed_one_says_so() {
     let model = open(&path);
     let mut metadata = model.metadata().clone();
     metadata.insert(KEY.to_owned(), "{\"seed\": -1}".to_owned());
-    let tensors = model.contents().map(|(name, dtype, shape, bytes)| Tensor {
-        name,
-        dtype,
-        shape: shape.to_vec(),
-        data: Data::Bytes(bytes),
-    });
-    container::write(&plain, tensors.collect(), &metadata, model::LAYOUT).expect("written");
+    model.save_with(&plain, &metadata).expect("written");
     let error = run(&open(&plain), Isa::best(), &Threads::calling()).expect_err("malformed");
     assert!(error.kind() == ErrorKind::Format && error.to_string().contains("self_test"), "{error}");
 }

@@ -109,7 +109,7 @@ mod tests {
     ) -> (Option<Published>, Confusion, Confusion) {
         let scorer =
             Scorer::new(4, 1, TRUTH, grid, &Options::default()).expect("sound").with_published(Some(published));
-        let prediction = Prediction { classes, support: None, logits: None };
+        let prediction = Prediction { classes, support: None, logits: None, confidence: None };
         let score = scorer.score(&truth(labels.to_vec()), &prediction).expect("a score");
         (scorer.published(), score.region(1), score.published)
     }

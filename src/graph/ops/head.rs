@@ -6,19 +6,37 @@ use crate::graph::call::{Call, Tile};
 use crate::graph::parts::Part;
 use crate::graph::recipe::{ConvNames, Recipe};
 use crate::graph::site::Site;
+use crate::graph::temperature::Temperature;
 use crate::graph::weights::{Dense, Values, Weights, packed, padded};
 use voxcast_kernels::LANES;
-use voxcast_kernels::head::{Head as Kernel, head, scratch_len};
+use voxcast_kernels::head::{Confidence, Head as Kernel, Results, head, scratch_len};
 use voxcast_kernels::panels::packed_len;
 
 /// Voxels that one worker classifies at a time.
 pub(super) const VOXELS: usize = 960;
 
-/// [`voxcast_kernels::head`]: x. Writes a class per voxel, and logits where the graph has a tensor for them.
+/// [`voxcast_kernels::head`]: x. Writes, where it is asked how sure it is, the codes of "occupied" and of the class; then a
+/// class per voxel; and logits where the graph has a tensor for them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Head {
     /// Classes.
     pub classes: usize,
+    /// The temperature at which it is asked how sure it is.
+    pub confidence: Option<Temperature>,
+}
+
+/// Where a head of this confidence writes a tile.
+pub(super) fn results<'a>(confidence: Option<Temperature>, site: &Site<'_>, tile: &mut Tile<'a>) -> Results<'a> {
+    let first = if confidence.is_some() { 2 } else { 0 };
+    Results {
+        classes: tile.output(first),
+        logits: (site.outputs.len() > first + 1).then(|| tile.output(first + 1)),
+        confidence: confidence.map(|temperature| Confidence {
+            scale: temperature.inverse(),
+            occupied: tile.output(0),
+            class: tile.output(1),
+        }),
+    }
 }
 
 impl Head {
@@ -92,7 +110,7 @@ impl Description for Head {
             weights: [0, 2, 4].map(|i| call.parts[i].panels()),
             biases: [1, 3, 5].map(|i| call.part(i)),
         };
-        let logits = (call.site.outputs.len() > 1).then(|| tile.output(1));
-        head(call.isa, &args, tile.positions.clone(), tile.output(0), logits, tile.scratch());
+        let results = results(self.confidence, &call.site, &mut tile);
+        head(call.isa, &args, tile.positions.clone(), results, tile.scratch());
     }
 }

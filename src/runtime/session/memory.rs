@@ -44,7 +44,8 @@ impl Tables {
             let message = "a model of int8 has no graph without the projection fold";
             return Err(Error::new(ErrorKind::Unsupported, message));
         }
-        let results = Results { logits: options.logits, coarse_heads: options.coarse_heads };
+        let confidence = options.confidence.then(|| model.temperature());
+        let results = Results { logits: options.logits, coarse_heads: options.coarse_heads, confidence };
         Self::of_graph(model, model.graph(options.unfolded, results), cameras, options)
     }
 

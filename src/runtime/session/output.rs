@@ -18,12 +18,25 @@ pub struct Occupancy<'a> {
     pub classes: &'a [u8],
     /// `[x, y, z, classes]`, if the session keeps them.
     pub logits: Option<&'a [f32]>,
+    /// How sure the network is of each voxel, if the session was asked to say so.
+    pub confidence: Option<Confidence<'a>>,
     /// How many feature pixels of level 1 each voxel is seen by, `[x, y, z]`: the entries of its row of the volume's
     /// matrix, masked cameras left out, at most 65535. All voxels within one of level 1 share its number. Where it is 0,
     /// no camera sees the place, and the class is a guess from the surroundings: not "free" but "unknown".
     pub support: &'a [u16],
     /// The cameras' part in this result.
     pub cameras: &'a [CameraStatus],
+}
+
+/// How sure a network is: probabilities from 0 to 1 as codes from 0 to 255, `[x, y, z]` each, by a softmax of the logits over
+/// the model's [temperature](crate::Model::temperature). How far they can be trusted is what `eval --calibration` measures.
+/// The same on every machine. Where a logit is NaN or the largest is infinite, both are 0.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Confidence<'a> {
+    /// The probability that the voxel is occupied: that its class is any but 0.
+    pub occupied: &'a [u8],
+    /// The probability of the voxel's class, which may be 0.
+    pub class: &'a [u8],
 }
 
 impl Occupancy<'_> {
@@ -95,6 +108,8 @@ pub(super) struct Output {
     classes: Range<usize>,
     /// Bytes of the logits of level 0 in it, if the graph has them.
     logits: Option<Range<usize>>,
+    /// Bytes of the codes of "occupied" and of the class, if the graph has them.
+    confidence: Option<[Range<usize>; 2]>,
     pub(super) support: Vec<u16>,
     pub(super) cameras: Vec<CameraStatus>,
     /// The rig and mask that `support` was counted for, by number.
@@ -104,16 +119,20 @@ pub(super) struct Output {
 impl Output {
     /// Zeros, unless the system has no memory for them.
     pub(super) fn new(graph: &Graph, plan: &Plan, cameras: usize) -> Option<Self> {
-        let place = |element| {
-            let outputs = graph.ids().zip(&graph.tensors).filter(|(_, t)| t.scope == Scope::Output);
-            let (id, tensor) = outputs.into_iter().find(|(_, t)| t.element == element)?;
-            let start = plan.place(id).bytes.start;
-            Some(start..start + tensor.bytes())
+        let places = |element| {
+            let outputs = graph.ids().zip(&graph.tensors).filter(move |(_, t)| t.scope == Scope::Output);
+            outputs.filter(move |(_, t)| t.element == element).map(|(id, tensor)| {
+                let start = plan.place(id).bytes.start;
+                start..start + tensor.bytes()
+            })
         };
+        let mut codes = places(Element::U8);
+        let classes = codes.next()?;
         Some(Self {
             memory: Arena::new(plan.bytes(Region::Output))?,
-            classes: place(Element::U8)?,
-            logits: place(Element::F32),
+            classes,
+            logits: places(Element::F32).next(),
+            confidence: codes.next().zip(codes.next()).map(|(occupied, class)| [occupied, class]),
             support: zeros(voxels(graph))?,
             cameras: zeros(cameras)?,
             visibility: 0,
@@ -126,6 +145,7 @@ impl Output {
             memory: Arena::new(other.memory.len())?,
             classes: other.classes.clone(),
             logits: other.logits.clone(),
+            confidence: other.confidence.clone(),
             support: zeros(other.support.len())?,
             cameras: zeros(other.cameras.len())?,
             visibility: 0,
@@ -135,7 +155,8 @@ impl Output {
     /// Whether it has as much memory as `other`, laid out the same.
     pub(super) fn fits(&self, other: &Self) -> bool {
         let lengths = |o: &Self| [o.memory.len(), o.support.len(), o.cameras.len()];
-        lengths(self) == lengths(other) && self.classes == other.classes && self.logits == other.logits
+        let places = |o: &Self| (o.classes.clone(), o.logits.clone(), o.confidence.clone());
+        lengths(self) == lengths(other) && places(self) == places(other)
     }
 
     /// Bytes that [`Output::new`] takes, unless they cannot be counted.
@@ -164,6 +185,12 @@ impl Output {
         self.logits.is_some()
     }
 
+    /// Whether it is known how sure the network is.
+    #[cfg(feature = "capi")]
+    pub(super) fn has_confidence(&self) -> bool {
+        self.confidence.is_some()
+    }
+
     /// The result, whose voxels are those of `grid`.
     pub(super) fn occupancy(&self, grid: Grid) -> Occupancy<'_> {
         let bytes = self.memory.bytes();
@@ -171,6 +198,10 @@ impl Output {
             grid,
             classes: &bytes[self.classes.clone()],
             logits: self.logits.clone().map(|logits| bytemuck::cast_slice(&bytes[logits])),
+            confidence: self.confidence.clone().map(|codes| {
+                let [occupied, class] = codes.map(|codes| &bytes[codes]);
+                Confidence { occupied, class }
+            }),
             support: &self.support,
             cameras: &self.cameras,
         }
@@ -231,7 +262,8 @@ mod tests {
     fn bits_by_hand() {
         let classes = [0, 1, 0, 0, 18, 0, 0, 7, 0, 255, 0];
         let grid = Grid::new([11, 1, 1], [[0.0, 1.0]; 3]);
-        let occupancy = Occupancy { grid, classes: &classes, logits: None, support: &[0; 11], cameras: &[] };
+        let occupancy =
+            Occupancy { grid, classes: &classes, logits: None, confidence: None, support: &[0; 11], cameras: &[] };
         let mut bits = [0xff; 2];
         occupancy.write_bits(&mut bits);
         assert_eq!((occupancy.bits_len(), bits), (2, [0b1001_0010, 0b10]));
@@ -260,7 +292,7 @@ mod tests {
             grids: [[4, 4, 4], [2, 2, 2], [1, 1, 1]],
             ..Network::built_in("nuscenes-200").expect("built in")
         };
-        let graph = Graph::build(&network, Results { logits: true, coarse_heads: false });
+        let graph = Graph::build(&network, Results { logits: true, ..Results::default() });
         let plan = Plan::new(&graph, 2, 1).expect("small");
         let mut output = Output::new(&graph, &plan, 2).expect("small");
         assert_eq!(Some(output.bytes()), Output::bytes_for(&graph, &plan, 2));

@@ -37,6 +37,18 @@ fn page(truth: Option<&[u8]>, scene: Option<&Scene>, title: &str, palette: &Pale
     Page { title, subtitle: "of a test", prediction, truth, scene, palette }.to_html()
 }
 
+#[test]
+fn confidence_travels_where_there_is_one() {
+    let (classes, palette) = (classes(), Palette::of(5));
+    let codes: Vec<u8> = (0..60).map(|i| 4 * i).collect();
+    let prediction = Occupancy::new("", &classes, Grid::new(GRID, BOUNDS), [0.0, 1.0]).unwrap();
+    let page = |prediction| Page { title: "", subtitle: "", prediction, truth: None, scene: None, palette: &palette };
+    let with = page(prediction.with_confidence(&codes).unwrap()).to_html().unwrap();
+    assert_eq!(inflated(&data(&with)["confidence"]), codes);
+    assert!(data(&page(prediction).to_html().unwrap())["confidence"].is_null());
+    assert_eq!(prediction.with_confidence(&codes[1..]).unwrap_err().kind(), ErrorKind::Mismatch);
+}
+
 fn data(html: &str) -> Value {
     let (_, json) = html.split_once("<script type=\"application/json\" id=\"data\">").unwrap();
     serde_json::from_str(json.split_once("</script>").unwrap().0).unwrap()

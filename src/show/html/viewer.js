@@ -56,6 +56,8 @@ const UNLABELLED = 255;
 const prediction = await unpack(data.prediction.classes, "deflate");
 const truth = data.truth && (await unpack(data.truth.classes, "deflate"));
 const support = data.support && new Uint16Array((await unpack(data.support, "deflate")).buffer);
+/** The probability that each voxel is occupied, 0 to 255. */
+const confidence = data.confidence && (await unpack(data.confidence, "deflate"));
 
 /** Kinds of difference, in the order of their groups from 1 on; red-green blindness leaves their colours apart. */
 const DIFFERENCES = [
@@ -91,7 +93,7 @@ for (const layer of layers) {
     layer.off = layer.key === "truth" ? layers[0].off : new Set();
 }
 
-const state = { layer: layers[0], low: 0, high: size[2], unseen: "hatched", unknown: false, overlay: true, view: "home" };
+const state = { layer: layers[0], low: 0, high: size[2], least: 0, unseen: "hatched", unknown: false, overlay: true, view: "home" };
 
 const thousands = (n) => n.toLocaleString("en").replaceAll(",", "\u2009");
 const percent = (part, whole) => (whole === 0 ? "–" : `${(100 * part / whole).toFixed(1)} %`);
@@ -121,7 +123,9 @@ const shown = new Uint16Array((size[0] + 2) * (size[1] + 2) * (size[2] + 2));
 
 /** Fills the shown grid by what the reader has chosen. */
 function choose() {
-    const { layer, unseen, unknown } = state;
+    const { layer, unseen, unknown, least } = state;
+    // The truth does not depend on how sure the network is.
+    const sure = least > 0 && layer.key !== "truth" && confidence;
     // By group and by whether a camera sees the voxel: what is shown.
     const seen = new Uint16Array(256).map((_, g) => (g && !layer.off.has(g) ? g : 0));
     const blind = seen.map((g) => (unseen === "hidden" ? 0 : g && unseen === "hatched" ? g | GHOST : g));
@@ -132,6 +136,7 @@ function choose() {
             const from = (x * size[1] + y) * size[2];
             const to = (x + 1) * step[0] + (y + 1) * step[1] + 1;
             for (let z = state.low; z < state.high; z++) {
+                if (sure && sure[from + z] < least && prediction[from + z]) continue;
                 const group = layer.groups[from + z];
                 shown[to + z] = support && support[from + z] === 0 ? blind[group] : seen[group];
             }
@@ -619,6 +624,7 @@ function facts([x, y, z]) {
     if (truth) lines.push(`${data.prediction.caption}: ${named(prediction[index])}`, `${data.truth.caption}: ${named(truth[index])}`);
     lines.push(`voxel ${x}, ${y}, ${z}`);
     lines.push([x, y, z].map((v, k) => `${"xyz"[k]} ${metres(low[k] + (v + 0.5) * edge[k])}`).join("  ") + " m");
+    if (confidence) lines.push(`occupied with ${percent(confidence[index], 255)}`);
     if (support) lines.push(support[index] ? `seen by ${thousands(support[index])} feature ${support[index] === 1 ? "pixel" : "pixels"}` : layer.key === "prediction" ? "seen by no camera: a guess" : "seen by no camera");
     return { name, rgb, lines };
 }
@@ -754,6 +760,33 @@ function fillHeight() {
                     show();
                 });
             }
+        });
+    });
+    update();
+}
+
+/** One thumb: voxels that are less likely to be occupied are hidden. */
+function fillConfidence() {
+    $("sure").hidden = !confidence;
+    if (!confidence) return;
+    const input = $("least");
+    const track = input.parentElement;
+    let frame = 0;
+    const update = () => {
+        const text = state.least ? `from ${Math.round(100 * state.least / 255)} %` : "all";
+        $("likely").textContent = text;
+        input.setAttribute("aria-valuetext", text);
+        track.style.setProperty("--from", state.least / 255);
+        track.style.setProperty("--to", 1);
+    };
+    Object.assign(input, { min: 0, max: 255, step: 1, value: 0 });
+    input.addEventListener("input", () => {
+        state.least = Number(input.value);
+        update();
+        canvas.dataset.laid = "false";
+        frame ||= requestAnimationFrame(() => {
+            frame = 0;
+            show();
         });
     });
     update();
@@ -934,6 +967,7 @@ fillFacts();
 fillLayers();
 fillClasses();
 fillHeight();
+fillConfidence();
 fillCameras();
 listen();
 themed();

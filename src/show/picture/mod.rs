@@ -13,6 +13,7 @@ mod legend;
 mod matrix;
 mod palette;
 mod patch;
+mod reliability;
 mod text;
 mod vehicle;
 mod voxels;
@@ -20,6 +21,7 @@ mod voxels;
 pub use animation::Animation;
 pub use matrix::{Matrix, draw_matrix};
 pub use palette::{Class, Palette};
+pub use reliability::{Curve, Diagram, Point, draw_diagram};
 pub use text::FONT_LICENSE;
 
 use crate::base::error::{Error, ErrorKind, Result};
@@ -54,6 +56,9 @@ pub struct Occupancy<'a> {
     pub(crate) grid: Grid,
     pub(crate) forward: [f32; 2],
     pub(crate) support: &'a [u16],
+    /// Read by pages, where the reader chooses what is hidden.
+    #[cfg(feature = "html")]
+    pub(crate) confidence: &'a [u8],
 }
 
 impl<'a> Occupancy<'a> {
@@ -93,7 +98,15 @@ impl<'a> Occupancy<'a> {
             return Err(Error::format(format!("forward direction {forward:?}, expected finite numbers, not both 0")));
         }
         let forward = [(fx / length) as f32, (fy / length) as f32];
-        Ok(Self { caption, classes, grid, forward, support: &[] })
+        Ok(Self {
+            caption,
+            classes,
+            grid,
+            forward,
+            support: &[],
+            #[cfg(feature = "html")]
+            confidence: &[],
+        })
     }
 
     /// The same with the number of pixels that see each voxel: places that no camera sees are hatched on the map and pale
@@ -107,6 +120,21 @@ impl<'a> Occupancy<'a> {
             return Err(Error::mismatch(message));
         }
         Ok(Self { support, ..self })
+    }
+
+    /// The same with the probability that each voxel is occupied, 0 to 255 for 0 to 1
+    /// ([`Confidence::occupied`](crate::Confidence::occupied)): pages get a slider that hides voxels by it. Pictures do not
+    /// change.
+    ///
+    /// # Errors
+    /// [`ErrorKind::Mismatch`] when `occupied` has not as many numbers as the grid has voxels.
+    #[cfg(feature = "html")]
+    pub fn with_confidence(self, occupied: &'a [u8]) -> Result<Self> {
+        if occupied.len() != self.classes.len() {
+            let message = format!("{} confidences, expected {}", occupied.len(), self.classes.len());
+            return Err(Error::mismatch(message));
+        }
+        Ok(Self { confidence: occupied, ..self })
     }
 
     /// Whether it is known that no camera sees voxel `index`.

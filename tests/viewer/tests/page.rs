@@ -33,6 +33,7 @@ struct World {
     classes: Vec<u8>,
     truth: Option<Vec<u8>>,
     support: Vec<u16>,
+    confidence: Vec<u8>,
     scene: Option<Scene>,
     palette: Palette,
     title: String,
@@ -55,6 +56,7 @@ impl World {
             classes,
             truth: None,
             support: vec![7; 75],
+            confidence: vec![204; 75],
             scene: Some(Scene { names: vec!["CAM_FRONT".into()], images: vec![image], lidar2img: vec![lidar2img] }),
             palette: Palette::of(17),
             title: "single.npz".into(),
@@ -82,6 +84,9 @@ impl World {
                 truth[index] = 255;
             }
         }
+        // Sure of all but the half with x below 0.
+        let confidence =
+            (0..classes.len()).map(|i| if 2 * (i / (grid[1] * grid[2])) < grid[0] { 100 } else { 255 }).collect();
         let support = frame.visible.iter().map(|&seen| 3 * u16::from(seen)).collect();
         Self {
             grid,
@@ -90,6 +95,7 @@ impl World {
             classes,
             truth: Some(truth),
             support,
+            confidence,
             scene: Some(frame.scene),
             palette: Palette::of(17),
             title: "street.npz".into(),
@@ -103,7 +109,7 @@ impl World {
         let page = Page {
             title: &self.title,
             subtitle: "of a test",
-            prediction: prediction.with_support(&self.support).unwrap(),
+            prediction: prediction.with_support(&self.support).unwrap().with_confidence(&self.confidence).unwrap(),
             truth: self.truth.as_deref(),
             scene: self.scene.as_ref(),
             palette: &self.palette,
@@ -295,6 +301,31 @@ fn layers_are_sliced_with_the_keyboard() {
 }
 
 #[test]
+fn what_is_less_likely_is_hidden() {
+    let world = World::street();
+    let browser = world.open(DESK);
+    let (all, pictured) = (triangles(&browser), stage(&browser));
+    assert_eq!(text(&browser, "likely"), "all");
+    browser.press("#least", "\u{e010}");
+    settle(&browser);
+    assert_eq!(text(&browser, "likely"), "from 100 %");
+    let (sure, left) = (triangles(&browser), stage(&browser));
+    assert!(sure > all / 5 && sure < 4 * all / 5, "{sure} of {all} triangles");
+    assert!(differing(&pictured, &left) > 2000, "{} pixels", differing(&pictured, &left));
+    // The truth is what it is.
+    browser.click(&layer("truth"));
+    settle(&browser);
+    let truth = triangles(&browser);
+    browser.press("#least", HOME);
+    settle(&browser);
+    assert_eq!((triangles(&browser), text(&browser, "likely").as_str()), (truth, "all"));
+    browser.click(&layer("prediction"));
+    settle(&browser);
+    assert_eq!(triangles(&browser), all);
+    quiet(&browser);
+}
+
+#[test]
 fn free_and_unknown_are_told_apart() {
     let world = World::street();
     let guesses = world.classes.iter().zip(&world.support).filter(|(c, s)| **c != 0 && **s == 0).count();
@@ -425,7 +456,8 @@ fn a_voxel_says_what_it_is() {
     let browser = world.open(DESK);
     browser.click("[data-view='top']");
     settle(&browser);
-    let expected = ["car", "voxel 2, 2, 0", "x 0.00  y 0.00  z −0.50 m", "seen by 7 feature pixels"];
+    let expected =
+        ["car", "voxel 2, 2, 0", "x 0.00  y 0.00  z −0.50 m", "occupied with 80.0 %", "seen by 7 feature pixels"];
     browser.press("#space", ENTER);
     let spoken = browser.run("return document.getElementById('spoken').textContent").as_str().unwrap().to_owned();
     assert!(expected.iter().all(|part| spoken.contains(part)), "{spoken}");

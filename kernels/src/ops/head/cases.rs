@@ -1,6 +1,6 @@
 //! [`super::head()`] with any arguments, and at the network's shapes.
 
-use super::{Head, head, scratch_len};
+use super::{Confidence, Head, Results, head, scratch_len};
 use crate::cases::{Bench, Case, Draw, MAX_WORK, Memory, Output, Weights, values};
 use crate::isa::Isa;
 use crate::matmul::Panels;
@@ -14,6 +14,8 @@ struct Call {
     classes: usize,
     rows: Range<usize>,
     logits: bool,
+    /// That of the confidence.
+    softmax_scale: Option<f32>,
     input: Vec<f32>,
     weights: [Weights; 3],
     biases: [Vec<f32>; 3],
@@ -34,6 +36,7 @@ pub(crate) fn draw(draw: &mut Draw) -> Option<impl Case + use<>> {
         biases: columns.map(|columns| draw.values(columns.next_multiple_of(16))),
         input: draw.values(voxels * channels),
         logits: draw.flag(),
+        softmax_scale: draw.flag().then(|| 0.1 + draw.extent(0, 40) as f32 / 10.0),
     })
 }
 
@@ -52,9 +55,15 @@ impl Case for Call {
             weights: weights.each_ref().map(|w| w.panels()),
             biases: biases.each_ref().map(|bias| &bias[..]),
         };
-        let kept = self.logits.then_some(&mut logits[..]);
-        head(isa, &args, self.rows.clone(), &mut classes, kept, &mut scratch);
-        Output { values: logits.to_vec(), codes: classes.iter().map(|class| i64::from(*class)).collect() }
+        let sure = if self.softmax_scale.is_some() { self.rows.len() } else { 0 };
+        let (mut occupied, mut class) = (memory.filled(sure, 255u8), memory.filled(sure, 255u8));
+        let confidence =
+            self.softmax_scale.map(|scale| Confidence { scale, occupied: &mut occupied, class: &mut class });
+        let logits_kept = self.logits.then_some(&mut logits[..]);
+        let results = Results { classes: &mut classes, logits: logits_kept, confidence };
+        head(isa, &args, self.rows.clone(), results, &mut scratch);
+        let codes = classes.iter().chain(&*occupied).chain(&*class);
+        Output { values: logits.to_vec(), codes: codes.copied().map(i64::from).collect() }
     }
 }
 
@@ -75,7 +84,7 @@ pub(crate) fn benches() -> Vec<Bench> {
             weights: weights.each_ref().map(|w| Panels::F32(w)),
             biases: biases.each_ref().map(|bias| &bias[..]),
         };
-        let chosen = &mut chosen[..rows.len()];
-        head(isa, &args, rows, chosen, Some(logits), &mut scratch);
+        let results = Results { classes: &mut chosen[..rows.len()], logits: Some(logits), confidence: None };
+        head(isa, &args, rows, results, &mut scratch);
     })]
 }

@@ -4,6 +4,7 @@ use super::{HeadI8, LayerI8, head_i8, scratch_len};
 use crate::cases::right_i8::{WeightsI8, left, padded};
 use crate::cases::{Bench, Case, Draw, MAX_WORK, Memory, Output, bytes};
 use crate::isa::Isa;
+use crate::ops::head::{Confidence, Results};
 use std::ops::Range;
 use std::vec;
 use std::vec::Vec;
@@ -13,6 +14,8 @@ struct Call {
     classes: usize,
     rows: Range<usize>,
     logits: bool,
+    /// That of the confidence.
+    softmax_scale: Option<f32>,
     signed: bool,
     input: Vec<i8>,
     weights: [WeightsI8; 3],
@@ -41,6 +44,7 @@ pub(crate) fn draw(draw: &mut Draw) -> Option<impl Case + use<>> {
         signed,
         scale: draw.value(),
         logits: draw.flag(),
+        softmax_scale: draw.flag().then(|| 0.1 + draw.extent(0, 40) as f32 / 10.0),
     })
 }
 
@@ -62,9 +66,15 @@ impl Case for Call {
         let mut chosen = memory.filled(self.rows.len(), 255u8);
         let mut logits = memory.filled(if self.logits { self.rows.len() * classes } else { 0 }, f32::NAN);
         let mut scratch = memory.filled(scratch_len(channels, classes), i32::MIN);
+        let sure = if self.softmax_scale.is_some() { self.rows.len() } else { 0 };
+        let (mut occupied, mut class) = (memory.filled(sure, 255u8), memory.filled(sure, 255u8));
+        let confidence =
+            self.softmax_scale.map(|scale| Confidence { scale, occupied: &mut occupied, class: &mut class });
         let kept = self.logits.then_some(&mut logits[..]);
-        head_i8(isa, &args, self.rows.clone(), &mut chosen, kept, &mut scratch);
-        Output { values: logits.to_vec(), codes: chosen.iter().copied().map(i64::from).collect() }
+        let results = Results { classes: &mut chosen, logits: kept, confidence };
+        head_i8(isa, &args, self.rows.clone(), results, &mut scratch);
+        let codes = chosen.iter().chain(&*occupied).chain(&*class);
+        Output { values: logits.to_vec(), codes: codes.copied().map(i64::from).collect() }
     }
 }
 
@@ -81,6 +91,7 @@ pub(crate) fn benches() -> Vec<Bench> {
             weights.each_ref().map(|w| LayerI8 { weights: &w.packed, sums: &w.sums, pairs: &w.pairs, bias: &bias });
         let multipliers = [&multiplier[..]; 2];
         let args = HeadI8 { input: &input, signed: false, channels, classes, layers, multipliers, scale: 0.01 };
-        head_i8(isa, &args, rows.clone(), &mut chosen[..rows.len()], Some(logits), &mut scratch);
+        let results = Results { classes: &mut chosen[..rows.len()], logits: Some(logits), confidence: None };
+        head_i8(isa, &args, rows, results, &mut scratch);
     })]
 }

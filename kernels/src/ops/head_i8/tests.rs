@@ -1,5 +1,6 @@
 use super::*;
 use crate::isa::Isa;
+use crate::ops::head::confidence::tests::sure;
 use crate::testing::Rng;
 use crate::testing::int8::{OwnedI8, PLAIN, WayI8, assert_same};
 use proptest::prelude::*;
@@ -31,7 +32,7 @@ impl Case {
         Self { voxels, channels, classes, signed: way.signed, input, layers, natural, scale: 0.0123 }
     }
 
-    /// Classes and logits. Classes must not depend on whether logits were asked for.
+    /// Classes and logits. Classes must not depend on what else was asked for, and the confidence is that of the logits.
     fn rows(&self, isa: Isa, rows: Range<usize>) -> (Vec<u8>, Vec<f32>) {
         let Self { channels, classes, signed, scale, .. } = *self;
         let layers = self.layers.each_ref().map(|layer| LayerI8 {
@@ -44,10 +45,15 @@ impl Case {
         let args = HeadI8 { input: &self.input, signed, channels, classes, layers, multipliers, scale };
         let mut scratch = vec![i32::MIN; scratch_len(channels, classes)];
         let mut alone = vec![255; rows.len()];
-        head_i8(isa, &args, rows.clone(), &mut alone, None, &mut scratch);
+        let results = Results { classes: &mut alone, logits: None, confidence: None };
+        head_i8(isa, &args, rows.clone(), results, &mut scratch);
         let (mut chosen, mut logits) = (vec![254; rows.len()], vec![f32::NAN; rows.len() * classes]);
-        head_i8(isa, &args, rows, &mut chosen, Some(&mut logits), &mut scratch);
+        let [mut occupied, mut class] = [vec![253; rows.len()], vec![252; rows.len()]];
+        let confidence = Confidence { scale: 0.7, occupied: &mut occupied, class: &mut class };
+        let results = Results { classes: &mut chosen, logits: Some(&mut logits), confidence: Some(confidence) };
+        head_i8(isa, &args, rows, results, &mut scratch);
         assert_eq!(chosen, alone, "logits change the classes");
+        assert_eq!([occupied, class], sure(isa, &logits, &chosen, 0.7), "not the confidence of the logits");
         (chosen, logits)
     }
 

@@ -7,10 +7,11 @@ use crate::base::error::Result;
 use crate::graph::call::{Call, Tile};
 use crate::graph::element::{Element, Elements};
 use crate::graph::ops::description::{Description, Machine, wide};
-use crate::graph::ops::head::{VOXELS, layers};
+use crate::graph::ops::head::{VOXELS, layers, results};
 use crate::graph::parts::Part;
 use crate::graph::scale::Scale;
 use crate::graph::site::Site;
+use crate::graph::temperature::Temperature;
 use crate::graph::weights::{Values, Weights};
 use voxcast_kernels::head_i8::{HeadI8 as Kernel, LayerI8, head_i8, scratch_len};
 
@@ -25,7 +26,7 @@ const LAYER: [usize; 3] = [0, PARTS, 2 * PARTS];
 /// The step of the last layer's sums, in the place of its multipliers.
 const SCALE: usize = LAYER[2] + MULTIPLIER;
 
-/// [`voxcast_kernels::head_i8`]: x. Writes a class per voxel, and logits where the graph has a tensor for them.
+/// [`voxcast_kernels::head_i8`]: x. Writes what [`Head`](crate::graph::ops::Head) does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct HeadI8 {
     /// Classes.
@@ -34,6 +35,8 @@ pub struct HeadI8 {
     pub signed: bool,
     /// Of the two hidden layers.
     pub hidden: [Scale; 2],
+    /// The temperature at which it is asked how sure it is.
+    pub confidence: Option<Temperature>,
 }
 
 impl HeadI8 {
@@ -129,7 +132,7 @@ impl Description for HeadI8 {
             multipliers: [LAYER[0], LAYER[1]].map(|layer| call.part(layer + MULTIPLIER)),
             scale: call.part::<f32>(SCALE)[0],
         };
-        let logits = (call.site.outputs.len() > 1).then(|| tile.output(1));
-        head_i8(call.isa, &args, tile.positions.clone(), tile.output(0), logits, tile.scratch());
+        let results = results(self.confidence, &call.site, &mut tile);
+        head_i8(call.isa, &args, tile.positions.clone(), results, tile.scratch());
     }
 }
