@@ -117,17 +117,19 @@ fn isa_threads_repetition_company_and_rig_swaps_do_not_show() {
 
 #[test]
 fn a_frame_leaves_nothing_behind() {
-    let network = small::network();
-    let model = small::model(&network, Precision::F32, Rewrites::ALL, 1);
-    let rig = small::rig(&network, 0.3);
-    let (images, others) = (Images::new(&network, 5), Images::new(&network, 6));
-    let mut session = session(&model, &rig, Isa::best(), Threads::new(2).unwrap());
-    let expected = run(&mut session, &images.views());
-    assert_ne!(run(&mut session, &others.views()), expected, "other images give another result");
-    assert_same(&run(&mut session, &images.views()), &expected, "after another frame");
-    // A failed frame neither.
-    assert!(session.run(&images.views()[1..]).is_err());
-    assert_same(&run(&mut session, &images.views()), &expected, "after a refused frame");
+    for precision in Precision::ALL {
+        let network = small::suited(small::network(), precision);
+        let model = small::model(&network, precision, Rewrites::ALL, 1);
+        let rig = small::rig(&network, 0.3);
+        let (images, others) = (Images::new(&network, 5), Images::new(&network, 6));
+        let mut session = session(&model, &rig, Isa::best(), Threads::new(2).unwrap());
+        let expected = run(&mut session, &images.views());
+        assert_ne!(run(&mut session, &others.views()), expected, "other images give another result");
+        assert_same(&run(&mut session, &images.views()), &expected, "after another frame");
+        // A failed frame neither.
+        assert!(session.run(&images.views()[1..]).is_err());
+        assert_same(&run(&mut session, &images.views()), &expected, "after a refused frame");
+    }
 }
 
 #[test]

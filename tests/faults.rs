@@ -28,11 +28,17 @@ fn frames_in_steady_state_fault_no_page() {
     let pages = std::hint::black_box(vec![1u8; 4 << 20]);
     assert!(faults()[1] > before[1], "the counter counts: {} bytes are new", pages.len());
 
-    let mut network = small::network();
+    for precision in [Precision::F32, Precision::I8] {
+        assert_no_faults(precision);
+    }
+}
+
+fn assert_no_faults(precision: Precision) {
+    let mut network = small::suited(small::network(), precision);
     network.image = [64, 96];
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("model");
-    std::fs::write(&path, small::model_bytes(&network, Precision::F32, Rewrites::ALL, 1)).unwrap();
+    std::fs::write(&path, small::model_bytes(&network, precision, Rewrites::ALL, 1)).unwrap();
     let model = std::sync::Arc::new(Model::open(&path).unwrap());
     let options = SessionOptions {
         isa: Isa::best(),
@@ -60,5 +66,5 @@ fn frames_in_steady_state_fault_no_page() {
             return;
         }
     }
-    panic!("page faults, from disk and others, in each 20 frames: {windows:?}");
+    panic!("{precision:?}: page faults, from disk and others, in each 20 frames: {windows:?}");
 }

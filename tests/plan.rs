@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use small::Images;
 use std::ops::Range;
 use std::path::Path;
-use voxcast::graph::{Graph, Lifetime, Results, Rewrites, Scope, TensorId};
+use voxcast::graph::{Graph, Lifetime, Results, Rewrites, Scale, Scope, TensorId};
 use voxcast::network::Block;
 use voxcast::plan::{Place, Plan, Region};
 use voxcast::weights::Precision;
@@ -31,10 +31,28 @@ fn plan_is_the_golden_one() {
     assert_eq!(found, golden);
 }
 
+/// The graph of a model of this precision; where it is of integers, each tensor's largest stands for 1.
+fn graph(network: &Network, precision: Precision, results: Results, rewrites: Rewrites) -> Graph {
+    match precision {
+        Precision::F32 | Precision::F16 => Graph::build(network, results).rewritten(rewrites),
+        Precision::I8 => {
+            let rewrites = Rewrites { batch_norm: true, winograd: false, ..rewrites };
+            let graph = Graph::build(network, results).rewritten(rewrites);
+            graph.quantise(&[], &mut |_| Scale::of_range(1.0)).unwrap()
+        }
+    }
+}
+
 #[test]
 fn memory_is_what_was_told() {
-    let network = small::network();
-    let model = small::model(&network, Precision::F32, Rewrites::ALL, 1);
+    for precision in [Precision::F32, Precision::I8] {
+        assert_told(precision);
+    }
+}
+
+fn assert_told(precision: Precision) {
+    let network = small::suited(small::network(), precision);
+    let model = small::model(&network, precision, Rewrites::ALL, 1);
     let rig = small::rig(&network, 0.3);
     for threads in [1, 3] {
         for flags in 0..16 {
@@ -121,11 +139,13 @@ proptest! {
     fn nothing_that_lives_at_once_overlaps(
         network in networks(),
         rewrites in rewrites(),
+        precision in prop::sample::select(vec![Precision::F32, Precision::I8]),
         coarse in any::<bool>(),
         workers in 1usize..4,
     ) {
         network.check().unwrap();
-        let graph = Graph::build(&network, Results { logits: coarse, coarse_heads: coarse, ..Results::default() }).rewritten(rewrites);
+        let results = Results { logits: coarse, coarse_heads: coarse, ..Results::default() };
+        let graph = graph(&network, precision, results, rewrites);
         let plan = Plan::new(&graph, network.cameras, workers).unwrap();
         let mut blocks: Vec<(Option<TensorId>, Place, Range<usize>)> = (0..workers)
             .map(|w| (None, Place { region: Region::Arena, bytes: plan.scratch(w) }, 0..graph.operations.len()))

@@ -8,9 +8,10 @@
 use libfuzzer_sys::fuzz_target;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
-use voxcast::graph::{Graph, Results, Rewrites};
-use voxcast::import::{Source, import};
+use voxcast::graph::{Graph, Results, Rewrites, Scale};
+use voxcast::import::{Integers, Source, import, import_int8};
 use voxcast::model::Options;
+use voxcast::model::ranges::{Range, Ranges};
 use voxcast::network::{Block, Sampling};
 use voxcast::plan::Plan;
 use voxcast::random::Random;
@@ -106,7 +107,7 @@ fn model(input: &mut Draw, network: &Network) -> Option<Arc<Model>> {
         Rewrites { winograd: false, ..Rewrites::ALL },
     ];
     let rewrites = rewrites[input.extent(0, 3)];
-    let precision = if input.flag() { Precision::F16 } else { Precision::F32 };
+    let precision = Precision::ALL[input.extent(0, 2)];
     let source =
         Weights { seed: u64::from(input.byte()), factor: [1.0, 1.0, 0.0, 1e3, 1e18, -1e30][input.extent(0, 5)] };
     for rewrites in [Rewrites::NONE, rewrites] {
@@ -118,13 +119,38 @@ fn model(input: &mut Draw, network: &Network) -> Option<Arc<Model>> {
         }
     }
     let file = scratch_file("session");
-    // What can be refused is a weight or a fold that overflows.
-    if let Err(e) = import(&source, network, Options { precision, rewrites }, &file, &mut |_, _| ()) {
+    let written = match precision {
+        Precision::I8 => {
+            let ranges = ranges(input, network, rewrites)?;
+            import_int8(&source, network, &Integers { rewrites, ranges: &ranges, keep_f32: &[] }, &file, &mut |_, _| ())
+        }
+        _ => import(&source, network, Options { precision, rewrites }, &file, &mut |_, _| ()),
+    };
+    // What can be refused is a weight or a fold that overflows, and steps that do not go with the weights.
+    if let Err(e) = written {
         assert_ne!(e.kind(), ErrorKind::Io, "{e}");
         return None;
     }
     let bytes = std::fs::read(&file).expect("what was just written");
     Some(Arc::new(Model::from_bytes(bytes).expect("what import wrote")))
+}
+
+/// Ranges of every tensor that integers have a scale for, around one that is drawn; none if batch norms stay.
+fn ranges(input: &mut Draw, network: &Network, rewrites: Rewrites) -> Option<Ranges> {
+    let graph = Graph::build(network, Results::ALL).rewritten(Rewrites { winograd: false, ..rewrites });
+    let mut names = vec![];
+    let scale = &mut |name: &str| {
+        names.push(name.to_owned());
+        Scale::of_range(1.0)
+    };
+    graph.quantise(&[], scale).ok()?;
+    let (middle, mut random) =
+        ([1e-6, 0.1, 1.0, 10.0, 300.0, 1e9][input.extent(0, 5)], Random::new(input.byte().into()));
+    let mut range = |name| {
+        let threshold = middle * f64::from(random.range(0.2, 5.0));
+        (name, Range { max: threshold, threshold })
+    };
+    Some(Ranges::new(network, 1, names.into_iter().map(&mut range).collect()))
 }
 
 fn is_small(graph: &Graph) -> bool {

@@ -11,15 +11,20 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use voxcast::checkpoint::Checkpoint;
 use voxcast::graph::Rewrites;
-use voxcast::import::{Source, import, import_to_bytes};
+use voxcast::import::{Integers, Source, import, import_int8_to_bytes, import_to_bytes};
 use voxcast::model::Options;
+use voxcast::model::ranges::Ranges;
+use voxcast::model::unpacked::Unpacked;
 use voxcast::network::BUILT_IN;
 use voxcast::picture::Palette;
 use voxcast::weights::Precision;
-use voxcast::{Error, ErrorKind, Network, selftest};
+use voxcast::{Error, ErrorKind, Isa, Network, Threads, selftest};
 
 /// The trained network that ships with voxcast (`docs/model-card.md`).
 static EDGE: &[u8] = include_bytes!("../../assets/edge.safetensors");
+
+/// The ranges of its tensors, measured on drawn streets (`docs/int8.md`).
+static EDGE_RANGES: &str = include_str!("../../assets/edge.ranges.json");
 
 /// A network with its weights, folded and packed as the kernels read them.
 #[pyclass(frozen, module = "voxcast")]
@@ -31,6 +36,15 @@ impl Model {
     pub(crate) fn of(model: voxcast::Model) -> Self {
         Self { model: Arc::new(model) }
     }
+}
+
+/// The network that ships in 8-bit integers, with its self-test.
+fn in_integers(half: &voxcast::Model) -> voxcast::Result<voxcast::Model> {
+    let ranges = Ranges::from_json(EDGE_RANGES, half.network())?;
+    let integers = Integers { rewrites: Rewrites::ALL, ranges: &ranges, keep_f32: &[] };
+    let bytes = import_int8_to_bytes(&Unpacked::new(half)?, half.network(), &integers, &mut |_, _| ())?;
+    let model = Arc::new(voxcast::Model::from_bytes(bytes)?);
+    voxcast::Model::from_bytes(selftest::record_to_bytes(&model, Isa::best(), &Threads::calling())?)
 }
 
 #[pymethods]
@@ -51,10 +65,21 @@ impl Model {
         Ok(Self::of(py.detach(|| voxcast::Model::from_bytes(data))?))
     }
 
-    /// The small trained network that ships with voxcast. It has seen drawn streets only and is not for driving.
+    /// The small trained network that ships with voxcast, in f16 as it ships or in int8 as `voxcast demo` runs it. It has seen drawn
+    /// streets only and is not for driving.
     #[staticmethod]
-    fn shipped(py: Python<'_>) -> Outcome<Self> {
-        Ok(Self::of(py.detach(|| voxcast::Model::from_bytes(EDGE))?))
+    #[pyo3(signature = (precision = "f16"))]
+    fn shipped(py: Python<'_>, precision: &str) -> Outcome<Self> {
+        let integers = match precision {
+            "f16" => false,
+            "int8" => true,
+            _ => return Err(one_of("precision", precision, "\"f16\" or \"int8\"")),
+        };
+        let made = || {
+            let half = voxcast::Model::from_bytes(EDGE)?;
+            if integers { in_integers(&half) } else { Ok(half) }
+        };
+        Ok(Self::of(py.detach(made)?))
     }
 
     /// Writes the model, by way of a temporary file beside it.
@@ -215,12 +240,13 @@ struct Plan {
     self_test: Option<voxcast::Threads>,
 }
 
+fn one_of(what: &str, found: &str, expected: &str) -> Failure {
+    Failure::Python(PyTypeError::new_err(format!("{what}: found {found:?}, expected {expected}")))
+}
+
 impl Wish {
     fn plan(self) -> Outcome<Plan> {
         let Self(network, output, precision, fold, exact, self_test, threads) = self;
-        let one_of = |what: &str, found: &str, expected: &str| {
-            Failure::Python(PyTypeError::new_err(format!("{what}: found {found:?}, expected {expected}")))
-        };
         let network = Network::from_json(&network)?;
         let unknown = || one_of("precision", &precision, "\"f32\" or \"f16\"");
         // int8 needs ranges, which the command line measures.

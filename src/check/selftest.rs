@@ -17,6 +17,7 @@ use crate::model::Model;
 use crate::network::Network;
 use crate::rig::RigBuilder;
 use crate::runtime::session::{Session, SessionOptions};
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 use voxcast_kernels::Isa;
@@ -179,15 +180,30 @@ pub fn run(model: &Arc<Model>, isa: Isa, threads: &Threads) -> Result<Report> {
 /// Those of [`Model::open`] and [`Session::new`]; failed writes, which leave the model as it was.
 pub fn record(path: &Path, isa: Isa, threads: &Threads) -> Result<()> {
     let model = Arc::new(Model::open(path)?);
+    let metadata = metadata(&model, isa, threads)?;
+    model.save_with(path, &metadata)
+}
+
+/// The bytes of the model with what the stimulus gave, as [`record`] writes them.
+///
+/// # Errors
+/// Those of [`Session::new`]; [`ErrorKind::TooLarge`] if the system has no memory for them.
+pub fn record_to_bytes(model: &Arc<Model>, isa: Isa, threads: &Threads) -> Result<Vec<u8>> {
+    let metadata = metadata(model, isa, threads)?;
+    model.to_bytes_with(&metadata)
+}
+
+/// The model's metadata with the self-test in it.
+fn metadata(model: &Arc<Model>, isa: Isa, threads: &Threads) -> Result<BTreeMap<String, String>> {
     let mut operations = Vec::new();
-    compute(&model, SEED, isa, threads, |name, _, _, digest| operations.push((name.to_owned(), hex(digest))))?;
+    compute(model, SEED, isa, threads, |name, _, _, digest| operations.push((name.to_owned(), hex(digest))))?;
     let (Some((_, classes)), Some((_, logits))) = (operations.pop(), operations.pop()) else {
         unreachable!("two at least")
     };
     let test = SelfTest { seed: SEED, operations, classes, logits };
     let mut metadata = model.metadata().clone();
     metadata.insert(KEY.to_owned(), serde_json::to_string(&test).unwrap_or_default());
-    model.save_with(path, &metadata)
+    Ok(metadata)
 }
 
 #[cfg(test)]

@@ -34,7 +34,7 @@ static EDGE_RANGES: &str = include_str!("../../assets/edge.ranges.json");
 Examples:
   voxcast demo -o demo-out
   voxcast demo -o demo-out --seed 1000007              (another street)
-  voxcast demo -o demo-out --precision int8            (sums in integers: faster, and exact)
+  voxcast demo -o demo-out --precision f32             (in floating point: slower, and hardly another result)
   voxcast demo -o demo-out --threads 1                 (the same digest as with any other number of threads)
   voxcast demo -o demo-out --threads 1 --isa scalar    (the same digest again)
 
@@ -44,8 +44,8 @@ pub struct Demo {
     /// Directory for scene/, model, rig, occupancy, picture and page
     #[arg(short, long, value_name = "DIR", default_value = "voxcast-demo")]
     output: PathBuf,
-    /// Precision of the network: f16 as it ships, or f32 or int8 made of that
-    #[arg(long, default_value = "f16", value_parser = ["f32", "f16", "int8", "i8"], hide_possible_values = true,
+    /// Precision of the network: f16 as it ships, or f32 or int8 made of that when the program starts
+    #[arg(long, default_value = "int8", value_parser = ["f32", "f16", "int8", "i8"], hide_possible_values = true,
         value_name = "f32|f16|int8")]
     precision: String,
     /// Which street is drawn; the network was trained on 0 to 5434
@@ -62,7 +62,7 @@ impl Demo {
         let options = frame::options(&self.machine)?;
 
         let model_path = directory.join("model.safetensors");
-        write_model(&model_path, Precision::parse(&self.precision).unwrap_or(Precision::F16), &options)?;
+        write_model(&model_path, Precision::parse(&self.precision).unwrap_or(Precision::I8), &options)?;
         let model = Arc::new(Model::open(&model_path)?);
         let network = model.network();
         let start = Instant::now();
@@ -112,9 +112,8 @@ impl Demo {
 
 /// Writes the network that ships with the program in a precision.
 fn write_model(path: &Path, precision: Precision, options: &SessionOptions) -> Result<()> {
-    voxcast::model::write_bytes(path, EDGE)?;
     if precision == Precision::F16 {
-        return Ok(());
+        return voxcast::model::write_bytes(path, EDGE);
     }
     let shipped = Model::from_bytes(EDGE)?;
     let (source, network, rewrites) = (Unpacked::new(&shipped)?, shipped.network(), Rewrites::ALL);

@@ -98,7 +98,7 @@ impl Import {
                 if precision == model.options().precision && self.fold == "all" && !self.exact {
                     let bar = terminal::progress("transforming", 0);
                     use_winograd(&model, &self.output, &mut steps(&bar)).map_err(|e| e.in_file(&self.checkpoint))?;
-                    return self.finish(&bar, &[]);
+                    return self.finish(&bar, &[], &[]);
                 }
                 let source = Unpacked::new(&model).map_err(|e| e.in_file(&self.checkpoint))?;
                 self.convert(&source, model.network(), precision, vec![])
@@ -155,26 +155,27 @@ impl Import {
             Precision::I8 => Some(self.ranges(source, network, rewrites)?),
             Precision::F32 | Precision::F16 => None,
         };
+        let keep_f32 = match (&ranges, self.auto_mixed) {
+            (Some(ranges), Some(target)) => self.mix(source, network, ranges, target)?,
+            _ => self.keep_f32.clone(),
+        };
         match &ranges {
             None => {
                 let options = Options { precision, rewrites };
                 voxcast::import::import(source, network, options, &self.output, progress)
             }
             Some(ranges) => {
-                let keep_f32 = match self.auto_mixed {
-                    Some(target) => self.mix(source, network, ranges, target)?,
-                    None => self.keep_f32.clone(),
-                };
                 let integers = Integers { rewrites, ranges, keep_f32: &keep_f32 };
                 voxcast::import::import_int8(source, network, &integers, &self.output, progress)
             }
         }
         .map_err(in_checkpoint)?;
-        self.finish(&bar, &notes)
+        self.finish(&bar, &notes, &keep_f32)
     }
 
     /// Adds the self-test, and says what was written.
-    fn finish(&self, bar: &ProgressBar, notes: &[Note]) -> Result<()> {
+    /// `asked` are the operations that were to stay in f32.
+    fn finish(&self, bar: &ProgressBar, notes: &[Note], asked: &[String]) -> Result<()> {
         if !self.no_self_test {
             bar.set_message("self-test");
             let hint = |e: Error| {
@@ -187,6 +188,7 @@ impl Import {
         bar.finish_and_clear();
         terminal::say(notes);
         let model = Model::open(&self.output)?;
+        terminal::say(&Vec::from_iter(offsets_note(&model, asked)));
         println!(
             "{}: {} weights, {}, checksum {:016x}",
             self.output.display(),
@@ -228,6 +230,15 @@ impl Import {
         let model = Arc::new(Model::from_bytes(bytes.map_err(|e| e.in_file(&self.checkpoint))?)?);
         calibrate::measure(&model, &self.calibrate, self.calibrate_frames, (Isa::best(), self.threads.threads()?))
     }
+}
+
+/// What is to be said of deformable convolutions that stay in f32 though nobody asked for it.
+fn offsets_note(model: &Model, asked: &[String]) -> Option<Note> {
+    let kept = model.quantisation()?.keep_f32.iter().filter(|name| !asked.contains(name)).count();
+    let message = format!(
+        "{kept} deformable convolutions stay in f32, for their offsets are farther than integers tell apart (inspect --operations)"
+    );
+    (kept > 0).then(|| Note::new(message))
 }
 
 /// How many of how many steps are done, on `bar`.

@@ -115,7 +115,7 @@ impl Inspect {
         if let Some(quantisation) = model.quantisation() {
             let asked = match quantisation.keep_f32.is_empty() {
                 true => String::new(),
-                false => format!(", asked for: {}", quantisation.keep_f32.join(",")),
+                false => format!(", by name: {}", quantisation.keep_f32.join(",")),
             };
             println!(
                 "int8       {} tensors with a scale; in f32: {} operations{asked}",

@@ -35,6 +35,30 @@ pub struct Dense {
     pub bias: Values,
 }
 
+/// What a column's sums are made of, as far as their scale depends on it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Span {
+    /// The largest magnitude of a weight.
+    pub weight: f64,
+    /// The bias.
+    pub bias: f64,
+}
+
+impl Span {
+    /// That of these weights and a bias.
+    pub fn of(weights: &[f64], bias: f64) -> Self {
+        Self { weight: weights.iter().fold(0.0, |most, w| most.max(w.abs())), bias }
+    }
+}
+
+impl Dense {
+    /// The spans of its outputs.
+    pub fn spans(&self) -> Vec<Span> {
+        let columns = self.weight.chunks_exact(self.weight.len() / self.bias.len()).zip(&self.bias);
+        columns.map(|(weights, &bias)| Span::of(weights, bias)).collect()
+    }
+}
+
 /// A source's weights, with norms folded in.
 #[derive(Clone, Copy)]
 pub struct Weights<'a>(pub &'a dyn Source);

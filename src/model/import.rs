@@ -5,7 +5,7 @@ pub use crate::graph::weights::Source;
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::file::container::{self, Data, Tensor};
 use crate::graph::parts::{Part, Precision};
-use crate::graph::weights::{Values, Weights};
+use crate::graph::weights::{Span, Values, Weights};
 use crate::graph::{Element, Graph, LEVELS, Operation, Results, Rewrites, Scale};
 #[cfg(feature = "import")]
 use crate::model::checkpoint::Checkpoint;
@@ -15,6 +15,7 @@ use crate::network::Network;
 use half::f16;
 use std::cell::RefCell;
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::path::Path;
 
 #[cfg(feature = "import")]
@@ -95,7 +96,8 @@ pub fn import_to_bytes(
     Conversion::new(source, Form::floating(network, options)?)?.bytes(progress)
 }
 
-/// How a model of 8-bit integers is made.
+/// How a model of 8-bit integers is made. A deformable convolution stays in floating point also where its offsets are farther than
+/// integers tell apart; the model's [`Quantisation::keep_f32`](crate::graph::Quantisation::keep_f32) has those too.
 #[derive(Clone, Debug)]
 pub struct Integers<'a> {
     /// Which rewrites come first. Batch norms are folded.
@@ -108,9 +110,11 @@ pub struct Integers<'a> {
 
 impl Integers<'_> {
     /// The form of the model. A scale that is finer than the sums of the weights that write its tensor is made as coarse as they
-    /// are, and with it whatever depends on it.
+    /// are, and with it whatever depends on it. Offsets have steps of their own: where these are too fine, they stay in f32.
     fn form(&self, source: &dyn Source, network: &Network) -> Result<Form> {
         let mut least: BTreeMap<String, f64> = BTreeMap::new();
+        let mut keep_f32 = self.keep_f32.to_vec();
+        let mut folded = Folded { source, spans: BTreeMap::new() };
         loop {
             let scale = |name: &str| {
                 let scale = self.ranges.scale(name)?;
@@ -118,10 +122,14 @@ impl Integers<'_> {
                 // A little more, for it is rounded to f32.
                 if scale.wide() < least { Scale::of_range(least * LEVELS * (1.0 + 1e-6)) } else { Ok(scale) }
             };
-            let quantisation = model::quantisation(network, self.rewrites, self.keep_f32, &scale)?;
+            let quantisation = model::quantisation(network, self.rewrites, &keep_f32, &scale)?;
             let form = Form::integers(network, self.rewrites, quantisation)?;
-            let Some((name, finest)) = too_fine(&form.graph(false, Results::ALL)?, source)? else { return Ok(form) };
-            if least.insert(name, finest).is_some_and(|before| finest <= before) {
+            let graph = form.graph(false, Results::ALL)?;
+            let Some((operation, finest)) = folded.too_fine(&graph)? else { return Ok(form) };
+            let tensor = graph.tensor(operation.output());
+            if tensor.scale.is_none() {
+                keep_f32.push(operation.name.clone());
+            } else if least.insert(tensor.name.clone(), finest).is_some_and(|before| finest <= before) {
                 // Another tensor's scale decides; the operation itself says what is wrong.
                 return Ok(form);
             }
@@ -129,18 +137,29 @@ impl Integers<'_> {
     }
 }
 
-/// The first tensor whose scale is finer than what writes it can write, and what that is.
-fn too_fine(graph: &Graph, source: &dyn Source) -> Result<Option<(String, f64)>> {
-    for operation in &graph.operations {
-        let tensor = graph.tensor(operation.output());
-        let finest = operation.op.description().finest(&graph.site(operation), &Weights(source))?;
-        if let Some((scale, finest)) = tensor.scale.zip(finest)
-            && scale.wide() < finest
-        {
-            return Ok(Some((tensor.name.clone(), finest)));
+/// What is known of a source's weights, each of which is read and folded once.
+struct Folded<'a> {
+    source: &'a dyn Source,
+    /// Of operations by name.
+    spans: BTreeMap<String, Vec<Span>>,
+}
+
+impl Folded<'_> {
+    /// The first operation whose output's steps are finer than it can write, and what it can.
+    fn too_fine<'g>(&mut self, graph: &'g Graph) -> Result<Option<(&'g Operation, f64)>> {
+        for operation in &graph.operations {
+            let (description, site) = (operation.op.description(), graph.site(operation));
+            let spans = match self.spans.entry(operation.name.clone()) {
+                Entry::Occupied(known) => known.into_mut(),
+                Entry::Vacant(unknown) => unknown.insert(description.spans(&site, &Weights(self.source))?),
+            };
+            let finest = description.finest(&site, spans);
+            if graph.tensor(operation.output()).scale.map_or(1.0, Scale::wide) < finest {
+                return Ok(Some((operation, finest)));
+            }
         }
+        Ok(None)
     }
-    Ok(None)
 }
 
 /// [`import`] to a model of 8-bit integers.

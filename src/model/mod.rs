@@ -185,11 +185,22 @@ impl Model {
 
     /// Writes the model with this metadata.
     pub(crate) fn save_with(&self, path: &Path, metadata: &BTreeMap<String, String>) -> Result<()> {
-        let tensors = self.contents().map(|(name, dtype, shape, bytes)| {
-            let shape = shape.to_vec();
-            Tensor { name, dtype, shape, data: Data::Bytes(bytes) }
-        });
-        crate::file::container::write(path, tensors.collect(), metadata, LAYOUT)
+        crate::file::container::write(path, self.stored(), metadata, LAYOUT)
+    }
+
+    /// The bytes that [`Model::save_with`] writes.
+    pub(crate) fn to_bytes_with(&self, metadata: &BTreeMap<String, String>) -> Result<Vec<u8>> {
+        crate::file::container::to_bytes(self.stored(), metadata, LAYOUT)
+    }
+
+    fn stored(&self) -> Vec<Tensor<'_>> {
+        let tensor = |(name, dtype, shape, bytes): (_, _, &[usize], _)| Tensor {
+            name,
+            dtype,
+            shape: shape.to_vec(),
+            data: Data::Bytes(bytes),
+        };
+        self.contents().map(tensor).collect()
     }
 
     /// The bytes of the file.

@@ -18,8 +18,6 @@ use std::process::Command;
 use std::sync::Arc;
 use voxcast::container::{self, Container, Data, Layout, Tensor};
 use voxcast::graph::Rewrites;
-use voxcast::import::import;
-use voxcast::model::Options;
 use voxcast::weights::Precision;
 use voxcast::{ImageView, Isa, Model, Session, SessionOptions, Threads, selftest};
 
@@ -35,12 +33,11 @@ struct Files {
 }
 
 impl Files {
-    fn new() -> Self {
+    fn new(precision: Precision) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let path = |name: &str| directory.path().join(name);
-        let network = small::tiny();
-        let options = Options { precision: Precision::F32, rewrites: Rewrites::ALL };
-        import(&small::Weights(1), &network, options, &path("model"), &mut |_, _| ()).unwrap();
+        let network = small::suited(small::tiny(), precision);
+        std::fs::write(path("model"), small::model_bytes(&network, precision, Rewrites::ALL, 1)).unwrap();
         std::fs::copy(path("model"), path("mute")).unwrap();
         selftest::record(&path("model"), Isa::best(), &Threads::calling()).unwrap();
         damage_self_test(&path("model"), &path("faulty"));
@@ -119,17 +116,19 @@ fn ppm(path: &Path, image: &ImageView<'_>) -> PathBuf {
 
 #[test]
 fn the_example_gives_the_digest_of_a_rust_session() {
-    let files = Files::new();
-    for link in [Link::Shared, Link::Archive { wrapped: false }] {
-        let program = compile("examples/infer.c", link, files.directory.path());
-        files.assert_digest(files.infer(&mut Command::new(&program)));
-        files.assert_digest(files.infer(&mut under_valgrind(&program)));
+    for precision in [Precision::F32, Precision::I8] {
+        let files = Files::new(precision);
+        for link in [Link::Shared, Link::Archive { wrapped: false }] {
+            let program = compile("examples/infer.c", link, files.directory.path());
+            files.assert_digest(files.infer(&mut Command::new(&program)));
+            files.assert_digest(files.infer(&mut under_valgrind(&program)));
+        }
     }
 }
 
 #[test]
 fn the_example_says_what_is_wrong() {
-    let files = Files::new();
+    let files = Files::new(Precision::F32);
     let program = compile("examples/infer.c", Link::Shared, files.directory.path());
     let bad = files.path("bad.ppm");
     std::fs::write(&bad, "P6 58 29 255\nshort").unwrap();
@@ -147,11 +146,13 @@ fn the_example_says_what_is_wrong() {
 
 #[test]
 fn every_promise_of_the_header_holds_natively_and_under_valgrind() {
-    let files = Files::new();
-    let program = compile("tests/capi/conformance.c", Link::Archive { wrapped: true }, files.directory.path());
-    for command in [&mut Command::new(&program), &mut under_valgrind(&program)] {
-        let found = files.assert_digest(files.conformance(command));
-        assert!(found.contains(&files.logits_digest), "{found}, expected {}", files.logits_digest);
+    for precision in [Precision::F32, Precision::I8] {
+        let files = Files::new(precision);
+        let program = compile("tests/capi/conformance.c", Link::Archive { wrapped: true }, files.directory.path());
+        for command in [&mut Command::new(&program), &mut under_valgrind(&program)] {
+            let found = files.assert_digest(files.conformance(command));
+            assert!(found.contains(&files.logits_digest), "{found}, expected {}", files.logits_digest);
+        }
     }
 }
 

@@ -80,6 +80,32 @@ fn operations_are_kept_by_name_and_by_measurement() {
 }
 
 #[test]
+fn offsets_that_integers_cannot_hold_stay_in_f32_unasked() {
+    let place = place();
+    let mut tensors = place.tensors();
+    for (name, (_, values)) in &mut tensors {
+        if name.ends_with("conv_offset.weight") {
+            values.iter_mut().for_each(|value| *value *= 1e4);
+        }
+    }
+    let [network, far, scene, int8] = ["network.json", "far", "scene", "int8"].map(|f| place.text(f));
+    fs::write(place.path("far"), plain_bytes(&tensors)).unwrap();
+    let import = ["import", &far, "--network", &network, "--precision", "int8", "--calibrate", &scene, "-o", &int8];
+    let output = voxcast(&import);
+    let said = super::text(&output.stderr);
+    assert_eq!(output.status.code(), Some(0), "{said}");
+    let told: Value = serde_json::from_str(&done(&["inspect", &int8, "--json"])).unwrap();
+    let kept: Vec<&str> = told["kept_f32"].as_array().unwrap().iter().map(|name| name.as_str().unwrap()).collect();
+    let deformed = kept.iter().filter(|name| name.ends_with("conv_offset")).count();
+    assert!(deformed > 0 && kept.contains(&"img_backbone.layer3.0.conv2"), "{kept:?}");
+    assert!(said.contains(&format!("note: {deformed} deformable convolutions stay in f32")), "{said}");
+    done(&["selftest", &int8, "--isa", "scalar"]);
+    // Said only of what nobody asked for.
+    let output = voxcast(&[&import[..], &["--keep-f32", "img_backbone.layer3,img_backbone.layer4"]].concat());
+    assert!(output.status.success() && !super::text(&output.stderr).contains("deformable"), "{output:?}");
+}
+
+#[test]
 fn what_cannot_become_int8_is_one_line() {
     let place = place();
     let [network, weights, scene, model] = ["network.json", "weights.pth", "scene", "model"].map(|f| place.text(f));

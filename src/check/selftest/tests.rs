@@ -58,6 +58,7 @@ fn recording_twice_gives_the_same_bytes() {
     let first = std::fs::read(&path).expect("a file");
     record(&path, Isa::best(), &Threads::new(2).expect("threads")).expect("a self-test");
     assert!(std::fs::read(&path).expect("a file") == first);
+    assert!(record_to_bytes(&open(&path), Isa::best(), &Threads::calling()).expect("a self-test") == first);
 }
 
 #[test]
@@ -74,6 +75,14 @@ fn wrong_weights_are_found_where_they_are() {
     assert!(fault.to_string().contains("down_conv3d.3"), "{fault}");
     let (_directory, path) = recorded(Precision::F32);
     rewrite(&path, |_| (), "img_backbone.conv1.weight", |bytes| bytes[2] ^= 0x40);
+    let fault = run(&open(&path), Isa::best(), &Threads::calling()).expect("a self-test").fault.expect("a fault");
+    assert_eq!((fault.operation.as_str(), fault.camera), ("img_backbone.conv1", Some(0)));
+}
+
+#[test]
+fn a_wrong_integer_is_found_where_it_is() {
+    let (_directory, path) = recorded(Precision::I8);
+    rewrite(&path, |_| (), "img_backbone.conv1.multiplier", |bytes| bytes[2] ^= 0x40);
     let fault = run(&open(&path), Isa::best(), &Threads::calling()).expect("a self-test").fault.expect("a fault");
     assert_eq!((fault.operation.as_str(), fault.camera), ("img_backbone.conv1", Some(0)));
 }

@@ -6,7 +6,7 @@ use crate::graph::element::Elements;
 use crate::graph::matrices::Level;
 use crate::graph::parts::Part;
 use crate::graph::site::Site;
-use crate::graph::weights::{Values, Weights};
+use crate::graph::weights::{Span, Values, Weights};
 use std::fmt::Debug;
 use voxcast_kernels::Isa;
 
@@ -62,13 +62,21 @@ pub trait Description: Debug + Sync {
         Ok(())
     }
 
-    /// The finest step of an 8-bit output to which sums of these weights can be brought, if there is one.
+    /// The spans of the columns whose sums are brought to an integer output's steps; none where there are no such sums. They do
+    /// not depend on a scale.
     ///
     /// # Errors
     /// Those of the source of the weights.
-    fn finest(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Option<f64>> {
+    fn spans(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Span>> {
         let _ = (site, weights);
-        Ok(None)
+        Ok(Vec::new())
+    }
+
+    /// The finest step of the output to which sums of columns of these spans can be brought; of an output without scale in units
+    /// of its own step. 0 if any will do.
+    fn finest(&self, site: &Site<'_>, spans: &[Span]) -> f64 {
+        let _ = (site, spans);
+        0.0
     }
 
     /// Bytes of scratch that a worker needs.

@@ -4,6 +4,7 @@ use super::step;
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::graph::scale::{LEVELS, Scale};
 use crate::graph::site::Site;
+use crate::graph::weights::Span;
 use voxcast_kernels::quantised::MULTIPLIER_BITS;
 
 /// The smallest multiplier: below, its own rounding would show in an output.
@@ -54,7 +55,8 @@ impl Steps {
     /// [`ErrorKind::Unsupported`] if the output's step, or the residual's, is too fine for the weights.
     pub(super) fn column(&self, weights: &[f64], bias: f64) -> Result<Column> {
         let power = super::power(MULTIPLIER_BITS);
-        let (scale, residual) = self.scale(weights, bias, LEAST_MULTIPLIER / power * self.output / self.input);
+        let least = LEAST_MULTIPLIER / power * self.output / self.input;
+        let (scale, residual) = self.scale(Span::of(weights, bias), least);
         if self.residual.is_some() && residual < 1.0 {
             return Err(self.refused("residual", self.residual.unwrap_or_default()));
         }
@@ -67,17 +69,16 @@ impl Steps {
         Ok(Column { weights, bias: (bias / unit).round(), residual, multiplier })
     }
 
-    /// The finest step of an output to which sums of the column of these weights can be brought: two of their units.
-    pub(super) fn finest(&self, weights: &[f64], bias: f64) -> f64 {
-        let (scale, _) = self.scale(weights, bias, 0.0);
+    /// The finest step of an output to which sums of a column of this span can be brought: two of their units.
+    pub(super) fn finest(&self, span: Span) -> f64 {
+        let (scale, _) = self.scale(span, 0.0);
         // What is lost where a step is rounded to f32, and the multiplier to an integer.
         2.0 * self.input * scale * (1.0 + 1e-6)
     }
 
-    /// The weights' scale, at least `least`, and the residual's multiplier.
-    fn scale(&self, weights: &[f64], bias: f64, least: f64) -> (f64, f64) {
-        let most = weights.iter().fold(0.0f64, |most, w| most.max(w.abs()));
-        let scale = (most / LEVELS).max(bias.abs() / (self.input * MOST_BIAS)).max(least);
+    /// The scale of weights of this span, at least `least`, and the residual's multiplier.
+    fn scale(&self, Span { weight, bias }: Span, least: f64) -> (f64, f64) {
+        let scale = (weight / LEVELS).max(bias.abs() / (self.input * MOST_BIAS)).max(least);
         let Some(step) = self.residual else { return (scale, 0.0) };
         let scale = scale.max(step / (self.input * MOST_RESIDUAL));
         let residual = (step / (self.input * scale)).floor();

@@ -10,7 +10,7 @@ use crate::graph::ops::description::{Description, Machine, wide};
 use crate::graph::ops::product as floating;
 use crate::graph::parts::Part;
 use crate::graph::site::Site;
-use crate::graph::weights::{Values, Weights};
+use crate::graph::weights::{Span, Values, Weights};
 use voxcast_kernels::conv::Geometry;
 use voxcast_kernels::conv_i8::{ConvI8 as Kernel, conv_i8, conv_i8_wide};
 
@@ -70,12 +70,16 @@ impl Description for ConvI8 {
         Ok(product::values(1, &columns, site.residual.is_some()))
     }
 
-    fn finest(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Option<f64>> {
-        if self.has_offsets(site) {
-            return Ok(None);
+    fn spans(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Span>> {
+        Ok(floating::dense(&self.geometry, self.geometry.channels, site, weights)?.spans())
+    }
+
+    fn finest(&self, site: &Site<'_>, spans: &[Span]) -> f64 {
+        if !self.has_offsets(site) {
+            return product::finest(Steps::of(site), spans);
         }
-        let dense = floating::dense(&self.geometry, self.geometry.channels, site, weights)?;
-        Ok(Some(product::finest(Steps::of(site), &dense.weight, &dense.bias)))
+        let each = spans.iter().enumerate().map(|(n, &span)| Steps::of(site).finest(span) / self.offset_step(site, n));
+        each.fold(0.0, f64::max)
     }
 
     fn verify(&self, site: &Site<'_>, parts: &[Elements<'_>]) -> std::result::Result<(), String> {

@@ -9,7 +9,7 @@ use crate::graph::ops::deconv::{TAPS, folded};
 use crate::graph::ops::description::{Description, Machine, whole_lines, wide};
 use crate::graph::parts::Part;
 use crate::graph::site::Site;
-use crate::graph::weights::{Values, Weights};
+use crate::graph::weights::{Span, Values, Weights};
 use voxcast_kernels::deconv3d_i8::{Deconv3dI8 as Kernel, deconv3d_i8};
 
 /// [`voxcast_kernels::deconv3d_i8`]: x. A residual is added after the ReLU.
@@ -47,11 +47,13 @@ impl Description for DeconvI8 {
         Ok(product::values(TAPS, &columns, site.residual.is_some()))
     }
 
-    fn finest(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Option<f64>> {
+    fn spans(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Span>> {
         let (weight, bias) = folded(site, weights)?;
-        let steps = Steps::of(site);
-        let finest = (0..site.channels).map(|n| steps.finest(&column(site, &weight, n), bias[n]));
-        Ok(Some(finest.fold(0.0, f64::max)))
+        Ok((0..site.channels).map(|n| Span::of(&column(site, &weight, n), bias[n])).collect())
+    }
+
+    fn finest(&self, site: &Site<'_>, spans: &[Span]) -> f64 {
+        product::finest(Steps::of(site), spans)
     }
 
     fn verify(&self, site: &Site<'_>, parts: &[Elements<'_>]) -> std::result::Result<(), String> {

@@ -9,7 +9,7 @@ use crate::graph::ops::description::{Description, Machine};
 use crate::graph::ops::product as floating;
 use crate::graph::parts::Part;
 use crate::graph::site::Site;
-use crate::graph::weights::{Values, Weights};
+use crate::graph::weights::{Span, Values, Weights};
 use voxcast_kernels::conv::Geometry;
 use voxcast_kernels::deform_conv2d_i8::{DeformConv2dI8 as Kernel, deform_conv2d_i8};
 
@@ -44,9 +44,12 @@ impl Description for DeformConvI8 {
         Ok(product::values(1, &columns, site.residual.is_some()))
     }
 
-    fn finest(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Option<f64>> {
-        let dense = floating::dense(&self.geometry, self.geometry.channels, site, weights)?;
-        Ok(Some(product::finest(Steps::of(site), &dense.weight, &dense.bias)))
+    fn spans(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Span>> {
+        Ok(floating::dense(&self.geometry, self.geometry.channels, site, weights)?.spans())
+    }
+
+    fn finest(&self, site: &Site<'_>, spans: &[Span]) -> f64 {
+        product::finest(Steps::of(site), spans)
     }
 
     fn verify(&self, site: &Site<'_>, parts: &[Elements<'_>]) -> std::result::Result<(), String> {

@@ -9,7 +9,7 @@ use crate::graph::ops::description::{Description, Machine, whole_lines, wide};
 use crate::graph::parts::Part;
 use crate::graph::recipe::Recipe;
 use crate::graph::site::Site;
-use crate::graph::weights::{Dense, Values, Weights, packed_taps, padded};
+use crate::graph::weights::{Dense, Span, Values, Weights, packed_taps, padded};
 use voxcast_kernels::LANES;
 use voxcast_kernels::depthwise::Depthwise;
 use voxcast_kernels::depthwise_i8::{DepthwiseI8 as Kernel, depthwise_i8};
@@ -62,9 +62,12 @@ impl Description for DepthwiseI8 {
         Ok(values)
     }
 
-    fn finest(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Option<f64>> {
-        let dense = self.dense(site, weights)?;
-        Ok(Some(product::finest(Steps::of(site), &dense.weight, &dense.bias)))
+    fn spans(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Span>> {
+        Ok(self.dense(site, weights)?.spans())
+    }
+
+    fn finest(&self, site: &Site<'_>, spans: &[Span]) -> f64 {
+        product::finest(Steps::of(site), spans)
     }
 
     fn verify(&self, site: &Site<'_>, parts: &[Elements<'_>]) -> std::result::Result<(), String> {

@@ -6,7 +6,7 @@ use crate::base::error::Result;
 use crate::graph::call::{Added, Call};
 use crate::graph::element::{Element, Elements};
 use crate::graph::parts::Part;
-use crate::graph::weights::Values;
+use crate::graph::weights::{Span, Values};
 use voxcast_kernels::LANES;
 use voxcast_kernels::matmul::int8::layout::{self, packed_index};
 use voxcast_kernels::matmul::int8::scratch_len;
@@ -90,10 +90,9 @@ pub(super) fn columns(
     columns.collect()
 }
 
-/// The finest step of an output to which sums of `dense` weights can be brought.
-pub(super) fn finest(steps: Steps, weight: &[f64], bias: &[f64]) -> f64 {
-    let columns = weight.chunks_exact(weight.len() / bias.len()).zip(bias);
-    columns.map(|(weight, &bias)| steps.finest(weight, bias)).fold(0.0, f64::max)
+/// The finest step of an output to which sums of columns of these spans can be brought.
+pub(super) fn finest(steps: Steps, spans: &[Span]) -> f64 {
+    spans.iter().map(|&span| steps.finest(span)).fold(0.0, f64::max)
 }
 
 /// Checks what kernels take for granted of [`values`].
