@@ -23,6 +23,7 @@ const STEP: usize = GROUP * super::LANES;
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Form {
     /// Whether left elements are -127..=127; else they are 0..=127.
+    #[cfg_attr(not(target_arch = "x86_64"), allow(dead_code, reason = "other products take signed elements anyway"))]
     pub(crate) signed: bool,
     /// Whether the products of two neighbouring groups can be added in 16 bits: in every column, the two weights of the one
     /// and the two of the other that meet in a 16-bit lane are together at most 258 in magnitude, and 127 * 258 < 2^15.

@@ -111,14 +111,20 @@ impl Simd for Neon {
         // SAFETY: every k is below `depth`, so the caller's promise holds for all loads; the token proves NEON.
         unsafe {
             for k in (0..whole).step_by(QUARTER) {
-                let a = left.map(|left| vld1q_f32(left.add(k)));
+                let mut a = [vdupq_n_f32(0.0); N];
+                for r in 0..N {
+                    a[r] = vld1q_f32(left[r].add(k));
+                }
                 step!(0, a, k);
                 step!(1, a, k);
                 step!(2, a, k);
                 step!(3, a, k);
             }
             for k in whole..depth {
-                let a = left.map(|left| vld1q_dup_f32(left.add(k)));
+                let mut a = [vdupq_n_f32(0.0); N];
+                for r in 0..N {
+                    a[r] = vld1q_dup_f32(left[r].add(k));
+                }
                 step!(0, a, k);
             }
         }

@@ -1,6 +1,8 @@
 //! 128 bits: a group of a panel is four registers of four columns. Plain NEON multiplies into 16 bits and adds neighbours;
 //! `sdot` and `smmla` do it in one instruction, and take signed elements. They are written as assembly: the oldest compiler
 //! that this crate supports has no intrinsics for them.
+//!
+//! Rows are loaded by loops, not by `map`: its closure is not inlined everywhere, and a call spills all sums.
 
 use super::{Form, GROUP, STEP};
 use crate::isa::Neon;
@@ -90,7 +92,10 @@ unsafe fn plain<const N: usize, const P: usize>(
     // SAFETY: every group is below `depth`, so the caller's promise holds for all loads.
     unsafe {
         for group in 0..depth / GROUP {
-            let a = left.map(|left| splat(left.add(group * GROUP)));
+            let mut a = [vdupq_n_s8(0); N];
+            for r in 0..N {
+                a[r] = splat(left[r].add(group * GROUP));
+            }
             for j in 0..P {
                 for q in 0..QUARTER {
                     let w = vld1q_s8(panels[j].add(group * STEP + q * WIDTH));
@@ -121,7 +126,10 @@ unsafe fn pairs<const N: usize, const P: usize>(
     // SAFETY: every group is below `depth`, so the caller's promise holds for all loads.
     unsafe {
         for k in (0..even).step_by(2 * GROUP) {
-            let a = left.map(|left| [splat(left.add(k)), splat(left.add(k + GROUP))]);
+            let mut a = [[vdupq_n_s8(0); 2]; N];
+            for r in 0..N {
+                a[r] = [splat(left[r].add(k)), splat(left[r].add(k + GROUP))];
+            }
             for j in 0..P {
                 for q in 0..QUARTER {
                     let w = panels[j].add(k * LANES + q * WIDTH);
@@ -173,14 +181,20 @@ unsafe fn dot<const N: usize, const P: usize>(
     // SAFETY: every group is below `depth`, so the caller's promise holds for all loads.
     unsafe {
         for group in (0..whole).step_by(QUARTER) {
-            let a = left.map(|left| vld1q_s8(left.add(group * GROUP)));
+            let mut a = [vdupq_n_s8(0); N];
+            for r in 0..N {
+                a[r] = vld1q_s8(left[r].add(group * GROUP));
+            }
             step!(0, a, group);
             step!(1, a, group + 1);
             step!(2, a, group + 2);
             step!(3, a, group + 3);
         }
         for group in whole..groups {
-            let a = left.map(|left| splat(left.add(group * GROUP)));
+            let mut a = [vdupq_n_s8(0); N];
+            for r in 0..N {
+                a[r] = splat(left[r].add(group * GROUP));
+            }
             step!(0, a, group);
         }
     }
