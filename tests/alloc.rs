@@ -20,12 +20,24 @@ use voxcast::{Budget, ImageView, Isa, Model, Network, Rig, Session, SessionOptio
 struct Counting;
 
 static COUNTING: AtomicBool = AtomicBool::new(false);
+/// Whether the process's first thread is the test harness's, which allocates when it says that a test takes long.
+static FIRST_IS_HARNESS: AtomicBool = AtomicBool::new(false);
 static CALLS: AtomicUsize = AtomicUsize::new(0);
 static BYTES: AtomicUsize = AtomicUsize::new(0);
 static HELD: AtomicIsize = AtomicIsize::new(0);
 
+/// Whether this is the process's first thread, so far as that is known. Allocates nothing.
+fn is_first() -> bool {
+    #[cfg(target_os = "linux")]
+    // SAFETY: both only ask the kernel for a number.
+    let first = unsafe { libc::gettid() == libc::getpid() };
+    #[cfg(not(target_os = "linux"))]
+    let first = false;
+    first
+}
+
 fn count(asked: usize, given_back: usize) {
-    if COUNTING.load(Ordering::SeqCst) {
+    if COUNTING.load(Ordering::SeqCst) && !(FIRST_IS_HARNESS.load(Ordering::SeqCst) && is_first()) {
         CALLS.fetch_add(1, Ordering::SeqCst);
         BYTES.fetch_add(asked, Ordering::SeqCst);
         HELD.fetch_add(asked as isize - given_back as isize, Ordering::SeqCst);
@@ -79,6 +91,7 @@ const FRAMES: usize = 100;
 
 #[test]
 fn everything_is_allocated_when_a_session_is_made_and_known_before() {
+    FIRST_IS_HARNESS.store(!is_first(), Ordering::SeqCst);
     let (calls, bytes) = counted(|| drop(std::hint::black_box(vec![0u8; 100])));
     assert_eq!((calls, bytes), (2, 100), "the counter counts");
     let (kept, bytes, calls) = held(|| std::hint::black_box(vec![0u8; 100]));
