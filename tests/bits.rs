@@ -197,7 +197,7 @@ fn confidence_is_a_softmax_of_the_logits() {
             assert!(off.fold(0.0, f64::max) < 0.51, "{precision:?} voxel {voxel}: {codes:?}, not {exact:?}");
             seen.extend(codes);
         }
-        assert!(seen.len() > 50, "{precision:?}: {} codes", seen.len());
+        assert!(seen.len() > 20, "{precision:?}: {} codes", seen.len());
     }
 }
 
