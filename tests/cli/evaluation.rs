@@ -318,7 +318,7 @@ fn confidence_is_fitted_and_its_calibration_counted() {
     let temperature = inspected["temperature"].as_f64().unwrap();
     assert!((0.01..100.0).contains(&temperature) && temperature != 1.0, "{temperature}");
     // In its own place, and no other than before.
-    assert!(fit(&fitted, "2").contains(&format!("(before {temperature})")));
+    assert!(fit(&fitted, "2").contains(&format!("(before {})", temperature as f32)));
     assert!(fs::read(&fitted).unwrap() == bytes);
     let counts = |model: &str| {
         done(&["eval", "--model", model, "--data", &data, "--json", &json, "--calibration"]);
