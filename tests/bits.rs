@@ -168,7 +168,7 @@ fn coarse_heads_and_observers_do_not_show() {
 /// nothing else.
 #[test]
 fn confidence_is_a_softmax_of_the_logits() {
-    for (precision, temperature) in [(Precision::F32, 1.0), (Precision::F16, 3.0), (Precision::I8, 0.4)] {
+    for (precision, temperature) in [(Precision::F32, 1.0), (Precision::F16, 0.4), (Precision::I8, 40.0)] {
         let network = small::suited(small::network(), precision);
         let (rig, images) = (small::rig(&network, 0.3), Images::new(&network, 5));
         let directory = tempfile::tempdir().unwrap();
@@ -199,7 +199,7 @@ fn confidence_is_a_softmax_of_the_logits() {
             assert!(off.fold(0.0, f64::max) < 0.51, "{precision:?} voxel {voxel}: {codes:?}, not {exact:?}");
             seen.extend(codes);
         }
-        assert!(seen.len() > 50, "{precision:?}: {} codes", seen.len());
+        assert!(seen.len() > 10, "{precision:?}: {} codes", seen.len());
     }
 }
 
