@@ -5,6 +5,7 @@ use super::status::{Failure, Outcome, invalid};
 use super::types::{MAX_THREADS, Options, Status};
 use crate::base::threads::Threads;
 use crate::runtime::session::SessionOptions;
+use std::mem::offset_of;
 use voxcast_kernels::{Isa, IsaError};
 
 /// The options at `options`, the default ones if it is null.
@@ -15,7 +16,7 @@ pub(super) unsafe fn read(options: *const Options) -> Outcome<SessionOptions> {
     let default = SessionOptions::default();
     // SAFETY: this function's own condition. Any bits are an `Options`.
     let Some(Options { isa, threads, logits, slice_cost, confidence, reserved, .. }) =
-        (unsafe { sized(options, "options") })?
+        (unsafe { sized(options, offset_of!(Options, confidence), "options") })?
     else {
         return Ok(default);
     };

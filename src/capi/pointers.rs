@@ -116,17 +116,18 @@ impl<'a, T> Room<'a, T> {
 }
 
 /// A struct that begins with its own size, as a caller of this or an older header fills it: what lies beyond the
-/// caller's is 0. A caller of a newer one is refused if it asks for anything that this library does not know.
+/// caller's is 0. A caller of a newer one is refused if it asks for anything that this library does not know. `least` is the
+/// size of the struct's first version.
 ///
 /// # Safety
 /// `place` is null, misaligned, or points to a `usize` and as many bytes, that one's among them, as it says. All zeros are
 /// a `T`, and so are any bits.
-pub(super) unsafe fn sized<T: Copy>(place: *const T, name: &str) -> Outcome<Option<T>> {
+pub(super) unsafe fn sized<T: Copy>(place: *const T, least: usize, name: &str) -> Outcome<Option<T>> {
     if place.is_null() {
         return Ok(None);
     }
     // SAFETY: this function's own condition.
-    let size = unsafe { struct_size(place, name) }?;
+    let size = unsafe { struct_size(place, least, name) }?;
     let known = size.min(size_of::<T>());
     let mut value = MaybeUninit::<T>::zeroed();
     // SAFETY: `known` bytes are in both, and `value` is new. It is all zeros where nothing is copied to.
@@ -151,7 +152,7 @@ pub(super) unsafe fn write_sized<T: Copy>(place: *mut T, value: &T, name: &str) 
         return Err(invalid(format!("{name} is NULL")));
     }
     // SAFETY: this function's own condition.
-    let size = unsafe { struct_size(place, name) }?;
+    let size = unsafe { struct_size(place, size_of::<T>(), name) }?;
     let (head, known) = (size_of::<usize>(), size.min(size_of::<T>()));
     // SAFETY: `known` bytes are in both, the first of them the size; what the caller has more becomes 0.
     unsafe {
@@ -162,18 +163,16 @@ pub(super) unsafe fn write_sized<T: Copy>(place: *mut T, value: &T, name: &str) 
     Ok(())
 }
 
-/// The size that a struct says it has, if that can be.
+/// The size that a struct says it has, if that can be: `least` or more.
 ///
 /// # Safety
 /// `place` is misaligned, or points to a `usize`.
-unsafe fn struct_size<T>(place: *const T, name: &str) -> Outcome<usize> {
+unsafe fn struct_size<T>(place: *const T, least: usize, name: &str) -> Outcome<usize> {
     if !place.is_aligned() {
         return Err(invalid(format!("{name} is not aligned to {} bytes", align_of::<T>())));
     }
     // SAFETY: it is aligned for a struct that begins with a `usize`, and the rest is this function's own condition.
     let size = unsafe { place.cast::<usize>().read() };
-    // The first version of every struct is the one of now.
-    let least = size_of::<T>();
     if !(least..=MAX_STRUCT).contains(&size) {
         return Err(invalid(format!("{name}: size is {size}, expected sizeof, {least} or more")));
     }

@@ -2,9 +2,9 @@
 
 use super::dataset::{DataSet, Frame, Grid};
 use super::journal::{Entry, Header, Journal};
-use super::subject::{Shard, Subject};
+use super::subject::{Scope, Subject};
 use super::summary::Summary;
-use super::{Confusion, FrameScore, Options, Prediction, Scorer, Totals};
+use super::{Confusion, FrameScore, Prediction, Scorer, Totals};
 use crate::base::digest;
 use crate::base::error::{Error, Result};
 use crate::base::note::{Note, Said};
@@ -78,27 +78,6 @@ impl Predictor {
             Some(path) => error.in_file(path),
             None => error,
         })
-    }
-}
-
-/// What an evaluation covers and measures.
-#[derive(Clone, Debug)]
-pub struct Scope {
-    /// What to score.
-    pub options: Options,
-    /// Whether the losses of the training are computed.
-    pub losses: bool,
-    /// Whether it is counted how often what the network was so sure of came true.
-    pub calibration: bool,
-    /// Only so many frames from the first on; all if none.
-    pub limit: Option<usize>,
-    /// Of these, which part.
-    pub shard: Shard,
-}
-
-impl Default for Scope {
-    fn default() -> Self {
-        Self { options: Options::default(), losses: false, calibration: false, limit: None, shard: Shard::WHOLE }
     }
 }
 

@@ -1,6 +1,6 @@
 //! What is evaluated, and which part of it is one's own.
 
-use super::{Kind, Scope};
+use super::{Kind, Options};
 use crate::base::digest;
 use crate::base::error::{Error, Result};
 use crate::eval::dataset::{DataSet, Published};
@@ -8,6 +8,27 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::fmt;
 use std::str::FromStr;
+
+/// What an evaluation covers and measures.
+#[derive(Clone, Debug)]
+pub struct Scope {
+    /// What to score.
+    pub options: Options,
+    /// Whether the losses of the training are computed.
+    pub losses: bool,
+    /// Whether it is counted how often what the network was so sure of came true.
+    pub calibration: bool,
+    /// Only so many frames from the first on; all if none.
+    pub limit: Option<usize>,
+    /// Of these, which part.
+    pub shard: Shard,
+}
+
+impl Default for Scope {
+    fn default() -> Self {
+        Self { options: Options::default(), losses: false, calibration: false, limit: None, shard: Shard::WHOLE }
+    }
+}
 
 /// What an evaluation is of: all that decides its numbers, as journals keep it. Two evaluations with equal subjects give
 /// equal numbers.

@@ -142,7 +142,7 @@ fn every_rewrite_leaves_a_sound_graph() {
 }
 
 /// Only what computes a convolution changes, and only where it is worth it: never more multiply-adds, and never weights
-/// that are larger than the maps.
+/// that are much larger than the maps.
 #[test]
 fn winograd_saves_work_and_leaves_all_else() {
     let mut executed = vec![];
@@ -159,7 +159,7 @@ fn winograd_saves_work_and_leaves_all_else() {
                     assert_eq!(Op::from(Conv { geometry }), old.op, "{}", old.name);
                     assert!(2 * graph.executed_multiply_adds(new) < graph.multiply_adds(new), "{}", old.name);
                     let maps = graph.tensor(new.inputs[0]).len() + geometry.rows() * new.channels;
-                    let most = if index < graph.camera_operations { maps } else { maps / 2 };
+                    let most = if index < graph.camera_operations { 3 * maps } else { maps / 2 };
                     assert!(shape.weights_len() <= most, "{}", old.name);
                 }
                 _ => assert_eq!(new, old),

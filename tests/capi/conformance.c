@@ -207,7 +207,8 @@ static void structs_of_other_sizes(void)
     options.later = 1;
     RETURNS(VOXCAST_INVALID_ARGUMENT, voxcast_session_memory(model, CAMERAS, &options.known, &bytes, SAID));
     for (size_t i = 0; i < sizeof wrong / sizeof *wrong; i++) {
-        options.known.size = wrong[i] == sizeof(voxcast_network) - 1 ? sizeof(voxcast_options) - 1 : wrong[i];
+        /* The first version ended where confidence begins. */
+        options.known.size = wrong[i] == sizeof(voxcast_network) - 1 ? offsetof(voxcast_options, confidence) - 1 : wrong[i];
         RETURNS(VOXCAST_INVALID_ARGUMENT, voxcast_session_memory(model, CAMERAS, &options.known, &bytes, SAID));
     }
 }

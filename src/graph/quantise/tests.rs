@@ -56,7 +56,7 @@ fn all_but_attention_is_in_integers() {
         assert_eq!(offsets, deformed);
         let Op::ConvI8(stem) = &graph.operations[1].op else { panic!("{:?}", graph.operations[1]) };
         assert_eq!((stem.geometry.channels, stem.signed), (3, true));
-        assert_eq!(graph.tensor(graph.operations[0].output()).channels, 4);
+        assert_eq!(graph.tensor(graph.operations[0].output()).channels, 3);
     }
 }
 
