@@ -249,7 +249,7 @@ pub(crate) fn calibrate_confidence(
         let set = named.open()?;
         let fit = eval::fit_temperature(&model.model, &*set, data, limit, &options, &mut |_, notes| {
             Python::attach(|py| {
-                let warned = warn(py, &said.fresh(notes.to_vec()), 1);
+                let warned = warn(py, said.fresh(notes.to_vec()), 1);
                 py.check_signals().and(warned).map_err(|error| {
                     raised = Some(error);
                     Error::new(ErrorKind::Unsupported, "the fit was interrupted")

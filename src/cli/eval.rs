@@ -50,7 +50,7 @@ pub struct Eval {
     /// Only the first N frames
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     limit: Option<u32>,
-    /// Frames that are computed at the same time, each with its own session. It does not change a result
+    /// Frames that are computed at the same time, each with its own session; no more than threads. It does not change a result
     #[arg(long, value_name = "N", default_value_t = Means::WORKERS as u16,
         value_parser = clap::value_parser!(u16).range(1..=256))]
     workers: u16,

@@ -84,7 +84,7 @@ impl Predictor {
 /// How frames are computed. None of it changes a result.
 #[derive(Clone, Copy, Debug)]
 pub struct Means {
-    /// Frames at a time, each with a session of its own.
+    /// Frames at a time, each with a session of its own; no more than threads.
     pub workers: usize,
     /// Threads of all of them together.
     pub threads: usize,
@@ -93,9 +93,10 @@ pub struct Means {
 }
 
 impl Means {
-    /// Frames at a time where nobody says how many: one, which takes the least memory, on every machine the same. The program
-    /// and the Python package have it from here; `benches/workers.rs` compares it with more.
-    pub const WORKERS: usize = 1;
+    /// Frames at a time where nobody says how many, at most as many as threads: two sessions of one thread each are faster than one of
+    /// two (docs/many-machines.md), and every further one takes the memory of a session. The program and the Python package have it
+    /// from here; `benches/workers.rs` compares it with others.
+    pub const WORKERS: usize = 2;
 }
 
 /// One or two predictors, the data set on which they are scored, and how.
@@ -206,7 +207,7 @@ impl Evaluation {
         watch: &mut dyn FnMut(usize, &[Note]) -> Result<()>,
     ) -> Result<()> {
         let left = self.left(totals);
-        let workers = means.workers.min(left.len());
+        let workers = means.workers.min(means.threads.max(1)).min(left.len());
         let threads = (means.threads / workers.max(1)).max(1);
         let next = AtomicUsize::new(0);
         let (sender, results) = channel::<Result<(Entry, Vec<Note>)>>();
