@@ -587,6 +587,7 @@ fn a_large_grid_takes_few_triangles() {
     }
     let mut world = World::single();
     world.support = classes.iter().enumerate().map(|(i, _)| u16::from(i / (256 * 32) % 256 > 20)).collect();
+    world.confidence = vec![255; classes.len()];
     (world.grid, world.classes, world.scene) = (grid, classes, None);
     (world.bounds, world.palette) = ([[0.0, 51.2], [-25.6, 25.6], [-2.0, 4.4]], Palette::of(20));
     let browser = world.open(DESK);
