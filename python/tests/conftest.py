@@ -9,7 +9,7 @@ import pytest
 
 import voxcast
 
-FRAMES = 6
+FRAMES = 12
 
 
 @pytest.fixture(scope="session")

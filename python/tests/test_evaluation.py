@@ -6,7 +6,7 @@ import pytest
 
 import voxcast
 
-FRAMES = 6
+FRAMES = 12
 
 
 def test_numbers_are_those_of_the_command_line(place, model, heldout, scores):

@@ -9,7 +9,7 @@ from ray.cluster_utils import Cluster
 import voxcast
 import voxcast.ray
 
-FRAMES = 6
+FRAMES = 12
 
 
 @pytest.fixture
