@@ -6,15 +6,15 @@
 mod small;
 
 use small::Images;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use voxcast::container::Container;
-use voxcast::graph::{Op, Results, Rewrites, TensorId};
+use voxcast::graph::{Op, Results, Rewrites, Tensor, TensorId};
 use voxcast::import::import_to_bytes;
 use voxcast::model::{Options, use_winograd};
 use voxcast::network::Block;
 use voxcast::weights::Precision;
-use voxcast::{ErrorKind, Model, Network, Session, SessionOptions, digest};
+use voxcast::{Budget, ErrorKind, Isa, Model, Network, Session, SessionOptions, Step, Threads, digest};
 use voxcast_kernels::conv::Geometry;
 use voxcast_kernels::panels::packed_index;
 
@@ -35,6 +35,11 @@ fn network() -> Network {
     }
 }
 
+/// The same with volumes so large that doubling them is worth it too.
+fn wide() -> Network {
+    Network { grids: [[60, 60, 4], [30, 30, 2], [15, 15, 1]], ..network() }
+}
+
 /// A model whose rounding stays as small as it is.
 fn model(network: &Network, precision: Precision, rewrites: Rewrites) -> Arc<Model> {
     let options = Options { precision, rewrites };
@@ -51,12 +56,36 @@ fn models(network: &Network, precision: Precision) -> [Arc<Model>; 2] {
     [exact, Arc::new(Model::read(&path).unwrap())]
 }
 
-/// The convolution that an operation computes, either way.
-fn geometry(op: &Op) -> Option<Geometry> {
+/// The convolution that an operation computes, either way, or of a transposed one that of each parity.
+fn geometries(op: &Op, input: &Tensor) -> Vec<Geometry> {
     match op {
-        Op::Conv(conv) => Some(conv.geometry),
-        Op::Winograd(winograd) => Some(winograd.geometry),
-        _ => None,
+        Op::Conv(conv) => vec![conv.geometry],
+        Op::Winograd(winograd) => vec![winograd.geometry],
+        Op::Deconv(_) | Op::WinogradDeconv(_) => {
+            let of = |parity: usize| Geometry {
+                input: input.extent,
+                channels: input.channels,
+                kernel: [2; 3],
+                stride: [1; 3],
+                dilation: [1; 3],
+                padding: [1 - parity / 4, 1 - parity / 2 % 2, 1 - parity % 2],
+                output: input.extent,
+            };
+            (0..8).map(of).collect()
+        }
+        other => panic!("no convolution: {other:?}"),
+    }
+}
+
+/// Where row `row` of part `part` of an operation's parts lies in the output.
+fn position(geometry: &Geometry, parts: usize, part: usize, row: usize) -> usize {
+    let [_, y, z] = geometry.output;
+    match parts {
+        1 => row,
+        _ => {
+            let at = [row / (y * z) * 2 + part / 4, row / z % y * 2 + part / 2 % 2, row % z * 2 + part % 2];
+            (at[0] * 2 * y + at[1]) * 2 * z + at[2]
+        }
     }
 }
 
@@ -79,17 +108,23 @@ fn errors(model: &Arc<Model>, exact: &Model, names: &[String]) -> BTreeMap<Strin
             let operation = event.operation;
             let Some(output) = event.output.get::<f32>() else { return };
             if names.contains(&operation.name) {
-                let geometry = geometry(&operation.op).unwrap();
+                let geometries = geometries(&operation.op, graph.tensor(operation.inputs[0]));
                 let (weights, bias) =
                     (part(format!("{}.weight", operation.name)), part(format!("{}.bias", operation.name)));
                 let residual = operation.residual.map(|r| (&written[&r.tensor], r.after));
                 let stride = graph.tensor(operation.output()).channels;
                 let sums = sums.entry(operation.name.clone()).or_default();
-                for row in 0..geometry.rows() {
+                let parts = geometries.len();
+                let outputs = geometries
+                    .iter()
+                    .zip(weights.chunks_exact(weights.len() / parts))
+                    .enumerate()
+                    .flat_map(|(part, of)| (0..of.0.rows()).map(move |row| (part, of, row)));
+                for (part, (geometry, weights), row) in outputs {
                     for n in 0..operation.channels {
-                        let mut exact = dot(&geometry, &written[&operation.inputs[0]], &weights, row, n);
+                        let mut exact = dot(geometry, &written[&operation.inputs[0]], weights, row, n);
                         exact += f64::from(bias[n]);
-                        let at = row * stride + operation.first_channel + n;
+                        let at = position(geometry, parts, part, row) * stride + operation.first_channel + n;
                         let added = residual.map_or((0.0, false), |(rows, after)| (f64::from(rows[at]), after));
                         exact += if added.1 { 0.0 } else { added.0 };
                         exact = if operation.relu { exact.max(0.0) } else { exact };
@@ -110,7 +145,7 @@ fn dot(geometry: &Geometry, input: &[f32], weights: &[f32], row: usize, n: usize
     let Geometry { input: extent, channels, kernel, output, padding, .. } = *geometry;
     let at = [row / output[2] / output[1], row / output[2] % output[1], row % output[2]];
     let mut sum = 0.0;
-    for tap in 0..kernel.iter().product() {
+    for tap in 0..kernel.iter().product::<usize>() {
         let tap_at = [tap / kernel[2] / kernel[1], tap / kernel[2] % kernel[1], tap % kernel[2]];
         let x: [usize; 3] = std::array::from_fn(|a| (at[a] + tap_at[a]).wrapping_sub(padding[a]));
         if (0..3).any(|a| x[a] >= extent[a]) {
@@ -127,21 +162,23 @@ fn dot(geometry: &Geometry, input: &[f32], weights: &[f32], row: usize, n: usize
 
 #[test]
 fn errors_of_every_operation_are_at_most_twice_those_of_direct_sums() {
-    let network = network();
-    let [exact, filtered] = models(&network, Precision::F32);
-    let graph = filtered.graph(false, Results::default());
-    let chosen = graph.operations.iter().filter(|o| matches!(o.op, Op::Winograd(_)));
-    let kinds: BTreeMap<String, &str> = chosen.map(|o| (o.name.clone(), o.op.description().kind())).collect();
-    for kind in ["conv2d F(2,3)", "conv2d F(4,3)", "conv3d F(2,3)", "conv3d F(4,3)"] {
-        assert!(kinds.values().any(|k| *k == kind), "{kind} is not among {kinds:?}");
+    let mut met = BTreeSet::new();
+    for network in [network(), wide()] {
+        let [exact, filtered] = models(&network, Precision::F32);
+        let graph = filtered.graph(false, Results::default());
+        let chosen = graph.operations.iter().filter(|o| matches!(o.op, Op::Winograd(_) | Op::WinogradDeconv(_)));
+        let kinds: BTreeMap<String, &str> = chosen.map(|o| (o.name.clone(), o.op.description().kind())).collect();
+        let names: Vec<String> = kinds.keys().cloned().collect();
+        let [direct, here] = [&exact, &filtered].map(|model| errors(model, &exact, &names));
+        let table: Vec<String> = names
+            .iter()
+            .map(|name| format!("{name} {}: {:.2e}, direct {:.2e}", kinds[name], here[name], direct[name]))
+            .collect();
+        assert!(names.iter().all(|name| here[name] <= 2.0 * direct[name]), "{}", table.join("\n"));
+        met.extend(kinds.into_values());
     }
-    let names: Vec<String> = kinds.keys().cloned().collect();
-    let [direct, here] = [&exact, &filtered].map(|model| errors(model, &exact, &names));
-    let table: Vec<String> = names
-        .iter()
-        .map(|name| format!("{name} {}: {:.2e}, direct {:.2e}", kinds[name], here[name], direct[name]))
-        .collect();
-    assert!(names.iter().all(|name| here[name] <= 2.0 * direct[name]), "{}", table.join("\n"));
+    let every = ["conv2d F(2,3)", "conv2d F(4,3)", "conv3d F(2,3)", "conv3d F(4,3)", "deconv3d F(3,2)"];
+    assert_eq!(met.into_iter().collect::<Vec<_>>(), every);
 }
 
 fn run(model: &Arc<Model>) -> (Vec<u8>, Vec<f32>) {
@@ -154,11 +191,43 @@ fn run(model: &Arc<Model>) -> (Vec<u8>, Vec<f32>) {
 }
 
 #[test]
+fn isa_threads_and_steps_do_not_show() {
+    let network = wide();
+    let model = model(&network, Precision::F32, Rewrites::ALL);
+    let rig = small::rig(&network, 0.0);
+    let images = Images::new(&network, 5);
+    let mut first: Option<Vec<f32>> = None;
+    let sets = Isa::available().flat_map(|isa| [1, 2, 3].map(|threads| (isa, threads)));
+    // The scalar code takes seconds for a frame.
+    for (isa, threads) in sets.filter(|&(isa, threads)| isa != Isa::Scalar || threads == 2) {
+        let threads_of = Threads::new(threads).unwrap();
+        let options = SessionOptions { isa, threads: threads_of, logits: true, ..SessionOptions::default() };
+        let mut session = Session::new(model.clone(), rig.clone(), &options).unwrap();
+        for whole in [true, false] {
+            let what = format!("{} {threads} threads, whole: {whole}", isa.name());
+            let found = if whole {
+                session.run(&images.views()).unwrap().logits.unwrap().to_vec()
+            } else if isa == Isa::Scalar {
+                continue;
+            } else {
+                for (camera, view) in images.views().iter().enumerate() {
+                    session.set_camera(camera, *view).unwrap();
+                }
+                while session.step(Budget::Slices(7)) != Step::Complete {}
+                session.occupancy().unwrap().logits.unwrap().to_vec()
+            };
+            let want = first.get_or_insert_with(|| found.clone());
+            assert!(found.iter().zip(&*want).all(|(a, b)| a.to_bits() == b.to_bits()), "{what}");
+        }
+    }
+}
+
+#[test]
 fn direct_sums_have_the_bits_that_they_always_had() {
     // One camera that looks along an axis: no sine or cosine that another machine might round in another way.
     let exact = small::model(&Network { cameras: 1, ..network() }, Precision::F32, EXACT, 1);
     let graph = exact.graph(false, Results::default());
-    assert!(!graph.operations.iter().any(|o| matches!(o.op, Op::Winograd(_))));
+    assert!(!graph.operations.iter().any(|o| matches!(o.op, Op::Winograd(_) | Op::WinogradDeconv(_))));
     let file = Container::from_bytes(exact.bytes().to_vec()).unwrap();
     assert!(!file.metadata().contains_key("winograd"), "a file of the form that earlier versions wrote");
     let (_, logits) = run(&exact);

@@ -93,7 +93,9 @@ impl Graph {
             );
             return Err(Error::new(ErrorKind::Unsupported, message));
         }
-        if let Some(other) = self.operations.iter().find(|o| matches!(o.op, Op::BatchNorm(_) | Op::Winograd(_))) {
+        if let Some(other) =
+            self.operations.iter().find(|o| matches!(o.op, Op::BatchNorm(_) | Op::Winograd(_) | Op::WinogradDeconv(_)))
+        {
             let message = format!(
                 "operation \"{}\": only networks with folded batch norms and direct convolutions run in integers",
                 other.name

@@ -2,7 +2,7 @@
 
 use super::matrices::Matrix;
 use super::operation::{Graph, Operation};
-use super::ops::{BatchNorm, Conv, Gather, Op, Winograd};
+use super::ops::{BatchNorm, Conv, Deconv, Gather, Op, Winograd, WinogradDeconv};
 use super::recipe::{ConvNames, Recipe};
 use super::tensor::TensorId;
 use voxcast_kernels::conv::Geometry;
@@ -60,18 +60,28 @@ impl Graph {
         self
     }
 
-    /// Computes convolutions by Winograd's minimal filtering where [`Shape::best`] says so: from their shapes alone. What they
-    /// read and write, and all that surrounds them, stays. Nothing that folds convolutions may come after it.
+    /// Computes convolutions, transposed ones too, by Winograd's minimal filtering where [`Shape::best`] and
+    /// [`Shape::best_deconv3d`] say so: from their shapes alone. What they read and write, and all that surrounds them, stays. Nothing that folds convolutions may come after it.
     ///
     /// Transformed weights may take three times the memory of the maps where every camera's pass reads them, and half as much as
     /// the maps where they are read once in a frame.
     #[must_use]
     pub fn use_winograd(mut self) -> Self {
         for (index, operation) in self.operations.iter_mut().enumerate() {
-            let Op::Conv(Conv { geometry }) = operation.op else { continue };
             let room = if index < self.camera_operations { [3, 1] } else { [1, 2] };
-            if let Some(shape) = Shape::best(&geometry, operation.channels, room) {
-                operation.op = Winograd { geometry, shape }.into();
+            let filtered: Option<Op> = match operation.op {
+                Op::Conv(Conv { geometry }) => {
+                    Shape::best(&geometry, operation.channels, room).map(|shape| Winograd { geometry, shape }.into())
+                }
+                Op::Deconv(Deconv) => {
+                    let x = &self.tensors[operation.inputs[0].0];
+                    Shape::best_deconv3d(x.extent, x.channels, operation.channels, room)
+                        .map(|shape| WinogradDeconv { shape }.into())
+                }
+                _ => None,
+            };
+            if let Some(op) = filtered {
+                operation.op = op;
             }
         }
         self

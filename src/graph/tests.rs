@@ -1,6 +1,6 @@
 //! The graph against the figures that are known of the published network.
 
-use super::ops::{BatchNorm, Conv, DeformConv, Winograd};
+use super::ops::{BatchNorm, Conv, Deconv, DeformConv, Winograd, WinogradDeconv};
 use super::*;
 use crate::network::Network;
 use std::collections::BTreeSet;
@@ -154,20 +154,27 @@ fn winograd_saves_work_and_leaves_all_else() {
         assert_eq!(graph.operations.len(), direct.operations.len());
         for (index, (new, old)) in graph.operations.iter().zip(&direct.operations).enumerate() {
             assert_eq!(graph.multiply_adds(new), direct.multiply_adds(old), "{}", old.name);
-            match new.op {
-                Op::Winograd(Winograd { shape, geometry }) => {
-                    assert_eq!(Op::from(Conv { geometry }), old.op, "{}", old.name);
+            let filtered = match new.op {
+                Op::Winograd(Winograd { shape, geometry }) => Some((shape, Op::from(Conv { geometry }))),
+                Op::WinogradDeconv(WinogradDeconv { shape }) => Some((shape, Op::from(Deconv))),
+                _ => None,
+            };
+            match filtered {
+                Some((shape, direct)) => {
+                    assert_eq!(direct, old.op, "{}", old.name);
                     assert!(2 * graph.executed_multiply_adds(new) < graph.multiply_adds(new), "{}", old.name);
-                    let maps = graph.tensor(new.inputs[0]).len() + geometry.rows() * new.channels;
+                    let maps = graph.tensor(new.inputs[0]).len() + shape.rows() * new.channels;
                     let most = if index < graph.camera_operations { 3 * maps } else { maps / 2 };
                     assert!(shape.weights_len() <= most, "{}", old.name);
                 }
-                _ => assert_eq!(new, old),
+                None => assert_eq!(new, old),
             }
             let restored = Operation { op: old.op.clone(), ..new.clone() };
             assert_eq!(&restored, old);
         }
-        let count = |o: &Operation| matches!(o.op, Op::Winograd(_));
+        let doubled = graph.operations.iter().filter(|o| matches!(o.op, Op::WinogradDeconv(_))).count();
+        assert_eq!(doubled, 2, "the two volumes with more voxels than weights");
+        let count = |o: &Operation| matches!(o.op, Op::Winograd(_) | Op::WinogradDeconv(_));
         let all: u64 = graph.operations.iter().filter(|o| count(o)).map(|o| graph.multiply_adds(o)).sum();
         let left: u64 = graph.operations.iter().filter(|o| count(o)).map(|o| graph.executed_multiply_adds(o)).sum();
         executed.push((graph.operations.iter().filter(|o| count(o)).count(), all as f64 / left as f64));

@@ -13,8 +13,10 @@ use std::collections::{BTreeMap, BTreeSet};
 const SCALES: &str = "scales";
 const KEEP_F32: &str = "keep_f32";
 
-/// Metadata key of a model whose convolutions use Winograd's minimal filtering where shapes make it worth while.
+/// Metadata key of a model whose convolutions, transposed ones too, use Winograd's minimal filtering where shapes make it worth while.
 const WINOGRAD: &str = "winograd";
+/// What it says: also of what the choice covers, for a file has the weights that the choice asks for.
+const WINOGRAD_USED: &str = "conv, deconv";
 
 /// Metadata key of a model whose temperature is not 1.
 pub(crate) const TEMPERATURE: &str = "temperature";
@@ -89,8 +91,10 @@ impl Form {
         // A model without the key has direct sums.
         let winograd = match metadata.get(WINOGRAD).map(String::as_str) {
             None => false,
-            Some("used") => true,
-            Some(other) => return Err(wrong(WINOGRAD, other, "used or no such key")),
+            Some(WINOGRAD_USED) => true,
+            Some(other) => {
+                return Err(wrong(WINOGRAD, other, &format!("\"{WINOGRAD_USED}\" or no such key; import it anew")));
+            }
         };
         let rewrites = Rewrites { batch_norm: flag("batch_norm")?, projection: flag("projection")?, winograd };
         if rewrites.projection && !rewrites.batch_norm {
@@ -125,7 +129,7 @@ impl Form {
             ("projection".to_owned(), flag(rewrites.projection)),
         ]);
         if rewrites.winograd {
-            metadata.insert(WINOGRAD.to_owned(), "used".to_owned());
+            metadata.insert(WINOGRAD.to_owned(), WINOGRAD_USED.to_owned());
         }
         if let Some(Quantisation { keep_f32, scales }) = &self.quantisation {
             metadata.insert(KEEP_F32.to_owned(), serde_json::to_string(keep_f32).unwrap_or_default());

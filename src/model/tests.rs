@@ -137,7 +137,7 @@ fn metadata_that_is_wrong_is_named() {
     refused(set("format", "pt"), "found \"pt\"");
     refused(set("precision", "f64"), "found \"f64\", expected f32, f16 or int8");
     refused(set("projection", "yes"), "found \"yes\", expected folded or kept");
-    refused(set("winograd", "kept"), "found \"kept\", expected used or no such key");
+    refused(set("winograd", "kept"), "found \"kept\", expected \"conv, deconv\" or no such key; import it anew");
     refused(set("batch_norm", "kept"), "the batch norms are not");
     refused(set("network", "{}"), "network JSON: missing field");
     let deeper = Network { depths: [2, 1, 1, 1], ..network() }.to_json();

@@ -4,14 +4,15 @@ use super::form::Form;
 use super::{LAYOUT, Model, Options, parts, stored, tensor};
 use crate::base::error::{Error, ErrorKind, Result};
 use crate::file::container::{self, Data, Tensor};
+use crate::graph::ops::{Op, Winograd, WinogradDeconv, transformed};
 use crate::graph::parts::Part;
-use crate::graph::{Elements, Op, Operation, Rewrites};
+use crate::graph::{Elements, Operation, Rewrites};
 use crate::model::import::encode;
 use std::cell::RefCell;
 use std::path::Path;
 use std::rc::Rc;
 use voxcast_kernels::Panels;
-use voxcast_kernels::panels::packed_index;
+use voxcast_kernels::panels::{packed_index, packed_len};
 
 /// Writes `model` to `path` with convolutions computed by Winograd's minimal filtering where their shapes make it worth
 /// while, by way of a temporary file beside `path`. Weights are transformed in f64, from the numbers that the model has; all
@@ -41,7 +42,7 @@ pub fn use_winograd(model: &Model, path: &Path, progress: &mut dyn FnMut(usize, 
                 if i == last {
                     (progress.borrow_mut())(index + 1, total);
                 }
-                transformed(model, operation, part, i)
+                made(model, operation, part, i)
             };
             let name = format!("{}.{}", operation.name, part.suffix);
             tensors.push(tensor(name, part, precision, Data::Make(Box::new(make))));
@@ -51,19 +52,23 @@ pub fn use_winograd(model: &Model, path: &Path, progress: &mut dyn FnMut(usize, 
 }
 
 /// The bytes of part `i` of an operation: the model's own, or its direct weights transformed.
-fn transformed(model: &Model, operation: &Operation, part: &Part, i: usize) -> Result<Vec<u8>> {
+fn made(model: &Model, operation: &Operation, part: &Part, i: usize) -> Result<Vec<u8>> {
     let precision = model.options().precision;
     let name = |suffix: &str| format!("{}.{suffix}", operation.name);
     let bytes = |name: &str| model.container.tensor(name).expect("checked when the model was opened").2;
     match &operation.op {
-        Op::Winograd(winograd) if i == 0 => {
-            let depth = winograd.geometry.depth();
+        Op::Winograd(Winograd { shape, .. }) | Op::WinogradDeconv(WinogradDeconv { shape }) if i == 0 => {
+            let depth = shape.direct_depth();
+            let part_len = packed_len(depth, shape.columns);
             let weights = Elements::new(precision.element(), bytes(&name("weight"))).panels();
-            let weight = |k, n| match weights {
-                Panels::F32(weights) => f64::from(weights[packed_index(depth, k, n)]),
-                Panels::F16(weights) => f64::from(weights[packed_index(depth, k, n)]),
+            let weight = |part, k, n| {
+                let at = part * part_len + packed_index(depth, k, n);
+                match weights {
+                    Panels::F32(weights) => f64::from(weights[at]),
+                    Panels::F16(weights) => f64::from(weights[at]),
+                }
             };
-            encode(&name(part.suffix), part, &winograd.transformed(weight), precision)
+            encode(&name(part.suffix), part, &transformed(shape, weight), precision)
         }
         _ => Ok(bytes(&name(part.suffix)).to_vec()),
     }

@@ -1,7 +1,9 @@
-//! Convolution by Winograd's minimal filtering: 3x3 in a plane, alone or with three taps across layers.
+//! Convolution by Winograd's minimal filtering: 3x3 in a plane, alone or with three taps across layers, and the transposed
+//! convolution of [`crate::deconv3d`].
 //!
-//! The plane is cut into tiles of m x m outputs, m = 2 or 4 ([`Scheme`]). A tile's (m + 2) x (m + 2) inputs are transformed,
-//! multiplied point by point with transformed weights, summed over channels, and the sums transformed back:
+//! The plane is cut into tiles of m x m outputs, m = 2, 3 or 4 ([`Scheme`]). A tile's (m + 2) x (m + 2) inputs, or 4 x 4 for
+//! m = 3, are transformed, multiplied point by point with transformed weights, summed over channels, and the sums transformed
+//! back:
 //!
 //! ```text
 //! V[c]   = B^T d[c] B                                  d[c]: the inputs of a tile in one layer and channel, zero outside
@@ -12,6 +14,10 @@
 //! An image is a plane (height, width) with one layer; a volume is a plane (x, y) with layers along z, whose taps are summed
 //! before the transform back, so that each layer is transformed once. F(4,3) in the plane needs a quarter of the
 //! multiplications; F(2,3) along all three axes would need 8/27.
+//!
+//! A transposed convolution with kernel 4 and stride 2 is eight *parts*, one per parity p of the output's indices, each a
+//! convolution with two taps per axis that starts p - 1 positions from where its outputs lie: F(3,2), with 4/9 of the multiplications.
+//! Output (x, y, z) of part p is output 2 (x, y, z) + p of the whole, and V is the same for both parities along z.
 //!
 //! The order of the sums: B^T first down each column of the tile, then along each row, as written in
 //! `transform.rs`; M in groups of [`Shape::group`] products, k over (kz, c) ascending, each group one fma chain from 0, the
@@ -42,7 +48,7 @@ pub struct Shape {
     pub plane: [usize; 2],
     /// Positions along the third axis: 1 for an image.
     pub layers: usize,
-    /// Taps along the third axis: 1, or 3 with a zero on either side.
+    /// Taps along the third axis: 1, or 3 with a zero on either side; 2 of a transposed convolution.
     pub layer_taps: usize,
     /// Input channels, a multiple of 16.
     pub channels: usize,
@@ -57,7 +63,7 @@ pub struct Shape {
 pub struct Winograd<'a> {
     /// What is convolved.
     pub shape: Shape,
-    /// `[plane, plane, layers, channels]`.
+    /// `[plane, layers, channels]`.
     pub input: &'a [f32],
     /// What [`Shape::pack`] made.
     pub weights: &'a [f32],
@@ -90,7 +96,7 @@ struct Layout {
     tiles: usize,
     /// Layers, at most.
     layers: usize,
-    /// Transformed layers of a tile: with a neighbour on either side where there are three taps.
+    /// Transformed layers of a tile: with a neighbour on either side unless there is one tap.
     stored: usize,
     /// Output columns, at most.
     columns: usize,
@@ -121,6 +127,34 @@ impl Shape {
         })
     }
 
+    /// The shape of the transposed convolution of [`crate::deconv3d`], from a multiple of 16 channels.
+    pub fn of_deconv3d(extent: [usize; 3], channels: usize, columns: usize) -> Option<Self> {
+        let [x, y, layers] = extent;
+        (channels > 0 && channels.is_multiple_of(LANES)).then_some(Self {
+            plane: [x, y],
+            layers,
+            layer_taps: 2,
+            channels,
+            columns,
+            scheme: Scheme::Three,
+        })
+    }
+
+    /// Distance between outputs of a part along every axis: 2 for a transposed convolution, otherwise 1.
+    fn step(&self) -> usize {
+        if self.scheme == Scheme::Three { 2 } else { 1 }
+    }
+
+    /// Convolutions that are computed of the same input: 8 parities of a transposed one, otherwise 1.
+    pub fn parts(&self) -> usize {
+        self.step().pow(3)
+    }
+
+    /// Layers on either side of those that are computed, of which taps read.
+    fn halo(&self) -> usize {
+        usize::from(self.layer_taps > 1)
+    }
+
     /// Products of a group, whose sum is one chain.
     pub fn group(&self) -> usize {
         if self.depth() < 64 { 16 } else { 32 }
@@ -131,15 +165,20 @@ impl Shape {
         self.plane.map(|v| v.div_ceil(self.scheme.outputs()))
     }
 
+    /// Input positions.
+    pub fn inputs(&self) -> usize {
+        self.plane[0] * self.plane[1] * self.layers
+    }
+
     /// Output positions.
     pub fn rows(&self) -> usize {
-        self.plane[0] * self.plane[1] * self.layers
+        self.parts() * self.inputs()
     }
 
     /// The output positions of a range of rows of tiles.
     pub fn positions(&self, tile_rows: &Range<usize>) -> Range<usize> {
-        let line = self.plane[1] * self.layers;
-        let position = |row: usize| (row * self.scheme.outputs()).min(self.plane[0]) * line;
+        let plane = self.parts() * self.plane[1] * self.layers;
+        let position = |row: usize| (row * self.scheme.outputs()).min(self.plane[0]) * plane;
         position(tile_rows.start)..position(tile_rows.end)
     }
 
@@ -147,7 +186,7 @@ impl Shape {
     /// [`Geometry::depth`] counts those of the formula. [`u64::MAX`] stands for more than that.
     pub fn multiply_adds(&self) -> u64 {
         let [down, across] = self.tiles().map(|v| v as u128);
-        let per_tile = [self.layers, self.scheme.points(), self.depth(), self.columns];
+        let per_tile = [self.parts(), self.layers, self.scheme.points(), self.depth(), self.columns];
         let count = per_tile.iter().try_fold(down * across, |a, &b| a.checked_mul(b as u128));
         count.and_then(|v| u64::try_from(v).ok()).unwrap_or(u64::MAX)
     }
@@ -159,13 +198,13 @@ impl Shape {
     }
 
     fn layout(&self) -> Layout {
-        let (points, halo) = (self.scheme.points(), self.layer_taps - 1);
+        let points = self.scheme.points();
         let layers = self.layers.min(LAYERS);
-        let stored = layers + halo;
+        let stored = layers + 2 * self.halo();
         let columns = self.columns.next_multiple_of(LANES).min(COLUMNS);
         // Whole register tiles of every instruction set.
         let step = 12 / gcd(12, layers);
-        let fewest = if self.weights_len() < MANY_WEIGHTS { FEWEST } else { ROWS };
+        let fewest = if self.part_len() < MANY_WEIGHTS { FEWEST } else { ROWS };
         let fit = BUDGET / (points * (stored * self.channels + layers * columns));
         let most = (ROWS / layers).min(self.tiles().iter().product());
         let tiles = fit.max(fewest.div_ceil(layers)).min(most);
@@ -185,11 +224,15 @@ impl Shape {
     fn check(&self) {
         assert!(self.plane[0] > 0 && self.plane[1] > 0 && self.layers > 0, "an extent is zero");
         assert!(self.columns > 0, "no output channels");
-        assert!(self.layer_taps == 1 || self.layer_taps == 3, "{} taps across layers", self.layer_taps);
+        let known = match self.scheme {
+            Scheme::Two | Scheme::Four => self.layer_taps == 1 || self.layer_taps == 3,
+            Scheme::Three => self.layer_taps == 2,
+        };
+        assert!(known, "{} taps across layers", self.layer_taps);
         assert!(self.channels > 0 && self.channels.is_multiple_of(LANES), "channels come in sixteens");
-        let numbers = [self.plane[1], self.layers, self.channels.max(self.columns).max(64), 64 * 3];
+        let numbers = [self.plane[1], self.layers, self.channels.max(self.columns).max(64), 64 * 8];
         let count = numbers.iter().try_fold(self.plane[0], |a, &b| a.checked_mul(b));
-        let weights = self.channels.checked_mul(self.columns.max(LANES)).and_then(|v| v.checked_mul(64 * 3));
+        let weights = self.channels.checked_mul(self.columns.max(LANES)).and_then(|v| v.checked_mul(64 * 16));
         assert!(
             count.is_some_and(|v| isize::try_from(v).is_ok()) && weights.is_some_and(|v| isize::try_from(v).is_ok()),
             "the shape overflows"
@@ -205,7 +248,7 @@ impl<'a> Winograd<'a> {
     fn check(&self, tile_rows: &Range<usize>, stride: usize, out: &[f32], scratch: &[f32]) {
         let shape = &self.shape;
         shape.check();
-        assert_eq!(self.input.len(), shape.rows() * shape.channels, "the input has another shape");
+        assert_eq!(self.input.len(), shape.inputs() * shape.channels, "the input has another shape");
         assert_eq!(self.weights.len(), shape.weights_len(), "transformed weights do not match the shape");
         assert!(self.bias.len() >= shape.columns.next_multiple_of(LANES), "the bias is shorter than the columns");
         let total = shape.tiles()[0];
@@ -235,7 +278,8 @@ impl<'a> Winograd<'a> {
 /// If a slice does not have the size that the shape asks for.
 ///
 /// # Determinism
-/// The same bits on every instruction set and for every division into rows of tiles. Other bits than [`crate::conv`].
+/// The same bits on every instruction set and for every division into rows of tiles. Other bits than [`crate::conv`] and
+/// [`crate::deconv3d`].
 pub fn winograd(
     isa: Isa,
     args: &Winograd<'_>,
@@ -246,6 +290,37 @@ pub fn winograd(
 ) {
     args.check(&tile_rows, stride, out, scratch);
     dispatch(isa, Run { args, tile_rows, stride, out, scratch });
+}
+
+/// One of the convolutions that the arguments stand for ([`Shape::parts`]).
+#[derive(Clone, Copy)]
+struct Part {
+    /// Its place among them: parity `(p_x * 2 + p_y) * 2 + p_z`.
+    index: usize,
+    /// Distance between its outputs along every axis.
+    step: usize,
+    /// The first of its outputs along each axis.
+    first: [usize; 3],
+}
+
+impl Part {
+    fn new(shape: &Shape, index: usize) -> Self {
+        let step = shape.step();
+        Self { index, step, first: [index / 4, index / 2 % 2, index % 2] }
+    }
+
+    /// By how many positions the inputs under the taps begin before the output.
+    #[inline(always)]
+    fn before(&self, axis: usize) -> usize {
+        1 - self.first[axis]
+    }
+
+    /// The output position of this part's output (x, y, z).
+    #[inline(always)]
+    fn position(&self, shape: &Shape, at: [usize; 3]) -> usize {
+        let [x, y, z] = [0, 1, 2].map(|a| at[a] * self.step + self.first[a]);
+        (x * shape.plane[1] * self.step + y) * shape.layers * self.step + z
+    }
 }
 
 struct Run<'a> {

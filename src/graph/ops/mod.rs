@@ -21,6 +21,7 @@ mod window_attention;
 mod winograd;
 
 pub use description::{Description, Machine, Shader};
+pub(crate) use winograd::transformed;
 
 /// Makes the type [`Op`] of a list of descriptions.
 macro_rules! operations {
@@ -56,6 +57,7 @@ operations! {
     normalise::Normalise,
     conv::Conv,
     winograd::Winograd,
+    winograd::WinogradDeconv,
     deform_conv::DeformConv,
     depthwise::Depthwise,
     batch_norm::BatchNorm,

@@ -1,8 +1,8 @@
-//! Convolution by Winograd's minimal filtering, which [`Graph::use_winograd`](crate::graph::Graph::use_winograd) puts where
-//! [`Conv`](super::Conv) stood.
+//! Convolutions by Winograd's minimal filtering, which [`Graph::use_winograd`](crate::graph::Graph::use_winograd) puts where
+//! [`Conv`](super::Conv) and [`Deconv`](super::Deconv) stood.
 
 use super::description::{Description, Machine};
-use super::product;
+use super::{Deconv, deconv, product};
 use crate::base::error::Result;
 use crate::graph::call::{Call, Tile};
 use crate::graph::parts::Part;
@@ -22,28 +22,20 @@ pub struct Winograd {
     pub shape: Shape,
 }
 
-impl Winograd {
-    /// The transformed weights of a convolution whose weight for output `n` at k over (tap, input) is `weight(k, n)`, rounded
-    /// to f32.
-    pub(crate) fn transformed(&self, weight: impl Fn(usize, usize) -> f64) -> Values {
-        let mut packed = vec![0.0; self.shape.weights_len()];
-        self.shape.pack(weight, &mut packed);
-        packed.into_iter().map(f64::from).collect()
-    }
-
-    /// Positions of the output that a row of the kernel's tiles has; the last row may have fewer.
-    fn row(&self) -> usize {
-        self.shape.scheme.outputs() * self.shape.plane[1] * self.shape.layers
-    }
+/// [`voxcast_kernels::winograd`] as a transposed convolution that doubles a volume: x. A residual is added after the ReLU.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct WinogradDeconv {
+    /// How x is walked.
+    pub shape: Shape,
 }
 
 impl Description for Winograd {
     fn kind(&self) -> &'static str {
         match (self.shape.layer_taps, self.shape.scheme) {
-            (1, Scheme::Two) => "conv2d F(2,3)",
             (1, Scheme::Four) => "conv2d F(4,3)",
-            (_, Scheme::Two) => "conv3d F(2,3)",
+            (1, _) => "conv2d F(2,3)",
             (_, Scheme::Four) => "conv3d F(4,3)",
+            (_, _) => "conv3d F(2,3)",
         }
     }
 
@@ -51,22 +43,20 @@ impl Description for Winograd {
         true
     }
 
-    /// Transformed weights are f32 in every model: half precision has too few digits for the sums that the transform back
-    /// takes of them.
     fn parts(&self, site: &Site<'_>) -> Vec<Part> {
-        let bias = site.channels.next_multiple_of(LANES);
-        vec![Part::plain("transformed", self.shape.weights_len()), Part::plain("bias", bias)]
+        parts(&self.shape, site)
     }
 
     fn evaluate(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
         let Dense { weight, bias } = product::dense(&self.geometry, site.input(0).channels, site, weights)?;
         let (inputs, depth) = (self.geometry.channels, self.geometry.depth());
         let taps = depth / inputs;
-        Ok(vec![self.transformed(|k, n| weight[n * depth + k % inputs * taps + k / inputs]), padded(bias)])
+        let at = |_, k, n| weight[n * depth + k % inputs * taps + k / inputs];
+        Ok(vec![transformed(&self.shape, at), padded(bias)])
     }
 
     fn scratch(&self, _: &Site<'_>) -> usize {
-        self.shape.scratch_len() * size_of::<f32>()
+        scratch(&self.shape)
     }
 
     fn multiply_adds(&self, site: &Site<'_>) -> u128 {
@@ -77,24 +67,91 @@ impl Description for Winograd {
         self.shape.multiply_adds().into()
     }
 
-    /// As many rows of the kernel's tiles as fill a block, but the same number for every worker.
     fn tile(&self, _: &Site<'_>, machine: Machine) -> usize {
-        let [down, across] = self.shape.tiles();
-        let blocks = (down * across * self.shape.layers).div_ceil(BLOCK_ROWS).next_multiple_of(machine.workers);
-        down.div_ceil(blocks) * self.row()
+        tile(&self.shape, machine)
     }
 
-    fn execute(&self, call: &Call<'_>, mut tile: Tile<'_>) {
-        let args = Kernel {
-            shape: self.shape,
-            input: call.input(0),
-            weights: call.part(0),
-            bias: call.part(1),
-            relu: call.site.relu,
-            residual: product::residual(call),
-        };
-        let (positions, stride, out) = product::rows(call, &mut tile);
-        let tile_rows = positions.start / self.row()..positions.end.div_ceil(self.row());
-        winograd(call.isa, &args, tile_rows, stride, out, tile.scratch());
+    fn execute(&self, call: &Call<'_>, tile: Tile<'_>) {
+        execute(&self.shape, call, tile);
     }
+}
+
+impl Description for WinogradDeconv {
+    fn kind(&self) -> &'static str {
+        "deconv3d F(3,2)"
+    }
+
+    fn parts(&self, site: &Site<'_>) -> Vec<Part> {
+        parts(&self.shape, site)
+    }
+
+    fn evaluate(&self, site: &Site<'_>, weights: &Weights<'_>) -> Result<Vec<Values>> {
+        let (folded, bias) = deconv::folded(site, weights)?;
+        Ok(vec![transformed(&self.shape, folded), padded(bias)])
+    }
+
+    fn scratch(&self, _: &Site<'_>) -> usize {
+        scratch(&self.shape)
+    }
+
+    fn multiply_adds(&self, site: &Site<'_>) -> u128 {
+        Deconv.multiply_adds(site)
+    }
+
+    fn executed_multiply_adds(&self, _: &Site<'_>) -> u128 {
+        self.shape.multiply_adds().into()
+    }
+
+    fn tile(&self, _: &Site<'_>, machine: Machine) -> usize {
+        tile(&self.shape, machine)
+    }
+
+    fn execute(&self, call: &Call<'_>, tile: Tile<'_>) {
+        execute(&self.shape, call, tile);
+    }
+}
+
+/// Transformed weights are f32 in every model: half precision has too few digits for the sums that the transform back takes
+/// of them.
+fn parts(shape: &Shape, site: &Site<'_>) -> Vec<Part> {
+    let bias = site.channels.next_multiple_of(LANES);
+    vec![Part::plain("transformed", shape.weights_len()), Part::plain("bias", bias)]
+}
+
+/// The transformed weights, rounded to f32, of what has the weight `weight(part, k, n)` for output `n` at k over (tap, input)
+/// of a part.
+pub(crate) fn transformed(shape: &Shape, weight: impl Fn(usize, usize, usize) -> f64) -> Values {
+    let mut packed = vec![0.0; shape.weights_len()];
+    shape.pack(weight, &mut packed);
+    packed.into_iter().map(f64::from).collect()
+}
+
+fn scratch(shape: &Shape) -> usize {
+    shape.scratch_len() * size_of::<f32>()
+}
+
+/// Positions of the output that a row of the kernel's tiles has; the last row may have fewer.
+fn row(shape: &Shape) -> usize {
+    shape.positions(&(0..1)).len()
+}
+
+/// As many rows of the kernel's tiles as fill a block, but the same number for every worker.
+fn tile(shape: &Shape, machine: Machine) -> usize {
+    let [down, across] = shape.tiles();
+    let blocks = (down * across * shape.layers * shape.parts()).div_ceil(BLOCK_ROWS).next_multiple_of(machine.workers);
+    down.div_ceil(blocks) * row(shape)
+}
+
+fn execute(shape: &Shape, call: &Call<'_>, mut tile: Tile<'_>) {
+    let args = Kernel {
+        shape: *shape,
+        input: call.input(0),
+        weights: call.part(0),
+        bias: call.part(1),
+        relu: call.site.relu,
+        residual: product::residual(call),
+    };
+    let (positions, stride, out) = product::rows(call, &mut tile);
+    let tile_rows = positions.start / row(shape)..positions.end.div_ceil(row(shape));
+    winograd(call.isa, &args, tile_rows, stride, out, tile.scratch());
 }

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::base::random::Random;
+use crate::graph::ops::{Winograd, WinogradDeconv, transformed};
 use crate::graph::parts::Storage;
 use crate::graph::{Op, Results, Rewrites};
 use crate::small;
@@ -152,10 +153,10 @@ fn transposed_weights_reach_the_voxels_that_they_should() {
     assert_eq!(seen.len(), 64, "each of the kernel's taps is used once");
 }
 
-/// Of every operation of a network that has both tiles, in planes and in volumes.
+/// Of every operation of networks that have all tiles, in planes and in volumes.
 #[test]
 fn transformed_weights_are_those_of_the_direct_convolution() {
-    let network = Network {
+    let small_volumes = Network {
         image: [96, 160],
         block: crate::network::Block::Basic,
         dcn: [false; 4],
@@ -165,23 +166,30 @@ fn transformed_weights_are_those_of_the_direct_convolution() {
         grids: [[24, 24, 4], [12, 12, 2], [6, 6, 1]],
         ..small::tiny()
     };
-    let graph = |winograd| Graph::build(&network, Results::ALL).rewritten(Rewrites { winograd, ..Rewrites::ALL });
-    let (source, direct, filtered) = (Drawn::default(), graph(false), graph(true));
+    let wide_volumes = Network { grids: [[64, 64, 4], [32, 32, 2], [16, 16, 1]], ..small_volumes.clone() };
     let mut kinds = BTreeSet::new();
-    for operation in &filtered.operations {
-        let Op::Winograd(winograd) = &operation.op else { continue };
-        kinds.insert(operation.op.description().kind());
-        let [old, new] = [&direct, &filtered].map(|graph| evaluate(&source, graph, &operation.name));
-        let depth = winograd.geometry.depth();
-        let expected = winograd.transformed(|k, n| f64::from(old[0][packed_index(depth, k, n)]));
-        assert_eq!(new[1], old[1], "{}: the bias", operation.name);
-        for (found, expected) in new[0].iter().zip(expected) {
-            assert_near(*found, expected, &operation.name);
+    for network in [small_volumes, wide_volumes] {
+        let graph = |winograd| Graph::build(&network, Results::ALL).rewritten(Rewrites { winograd, ..Rewrites::ALL });
+        let (source, direct, filtered) = (Drawn::default(), graph(false), graph(true));
+        for operation in &filtered.operations {
+            let (Op::Winograd(Winograd { shape, .. }) | Op::WinogradDeconv(WinogradDeconv { shape })) = &operation.op
+            else {
+                continue;
+            };
+            kinds.insert(operation.op.description().kind());
+            let [old, new] = [&direct, &filtered].map(|graph| evaluate(&source, graph, &operation.name));
+            let depth = shape.direct_depth();
+            let size = packed_len(depth, shape.columns);
+            let weight = |part, k, n| f64::from(old[0][part * size + packed_index(depth, k, n)]);
+            assert_eq!(new[1], old[1], "{}: the bias", operation.name);
+            for (found, expected) in new[0].iter().zip(transformed(shape, weight)) {
+                assert_near(*found, expected, &operation.name);
+            }
         }
     }
     assert_eq!(
         kinds.into_iter().collect::<Vec<_>>(),
-        ["conv2d F(2,3)", "conv2d F(4,3)", "conv3d F(2,3)", "conv3d F(4,3)"]
+        ["conv2d F(2,3)", "conv2d F(4,3)", "conv3d F(2,3)", "conv3d F(4,3)", "deconv3d F(3,2)"]
     );
 }
 

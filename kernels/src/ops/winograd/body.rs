@@ -1,7 +1,7 @@
 //! The vector body: block by block, so that what is transformed is used while it is close.
 
-use super::transform::{Four, SIDE, Transform, Two};
-use super::{Layout, ROWS, Run, Scheme, Shape};
+use super::transform::{Four, SIDE, Three, Transform, Two};
+use super::{Layout, Part, ROWS, Run, Scheme, Shape};
 use crate::matmul::driver::{DEPTH, Linear, Target};
 use crate::matmul::epilogue::{End, Epilogue, Place};
 use crate::matmul::tile::{Arithmetic, Single};
@@ -20,13 +20,14 @@ impl Kernel for Run<'_> {
     fn run<S: Simd>(self, s: S) {
         match self.args.shape.scheme {
             Scheme::Two => self.blocks::<S, Two>(s),
+            Scheme::Three => self.blocks::<S, Three>(s),
             Scheme::Four => self.blocks::<S, Four>(s),
         }
     }
 }
 
 /// Which tiles and layers are computed together.
-struct Part {
+struct Block {
     tiles: Range<usize>,
     layers: Range<usize>,
 }
@@ -140,15 +141,21 @@ impl Run<'_> {
         let tiles = self.tile_rows.start * across..self.tile_rows.end * across;
         for first in tiles.clone().step_by(layout.tiles) {
             for layer in (0..shape.layers).step_by(layout.layers) {
-                let part = Part {
+                let block = Block {
                     tiles: first..tiles.end.min(first + layout.tiles),
                     layers: layer..shape.layers.min(layer + layout.layers),
                 };
-                self.inputs::<S, T>(s, &layout, &part);
-                for column in (0..shape.columns).step_by(layout.columns) {
-                    let columns = column..shape.columns.min(column + layout.columns);
-                    self.products(s, &layout, &part, &columns);
-                    self.outputs::<S, T>(s, &layout, &part, &columns);
+                // Parts that differ along the layers alone read the same transformed inputs.
+                for parts in (0..shape.parts()).step_by(shape.step()) {
+                    self.inputs::<S, T>(s, &layout, &block, &Part::new(&shape, parts));
+                    for part in parts..parts + shape.step() {
+                        let part = Part::new(&shape, part);
+                        for column in (0..shape.columns).step_by(layout.columns) {
+                            let columns = column..shape.columns.min(column + layout.columns);
+                            self.products(s, &layout, &block, &part, &columns);
+                            self.outputs::<S, T>(s, &layout, &block, &part, &columns);
+                        }
+                    }
                 }
             }
         }
@@ -164,38 +171,48 @@ impl Run<'_> {
 
     /// Transforms the inputs: `[point][tile][layer][channel]`.
     #[inline(always)]
-    fn inputs<S: Simd, T: Transform>(&mut self, s: S, layout: &Layout, part: &Part) {
+    fn inputs<S: Simd, T: Transform>(&mut self, s: S, layout: &Layout, block: &Block, part: &Part) {
         let shape = self.args.shape;
-        let halo = shape.layer_taps / 2;
-        for (i, tile) in part.tiles.clone().enumerate() {
+        let halo = shape.halo();
+        for (i, tile) in block.tiles.clone().enumerate() {
             let corner = self.corner(tile);
             // The inputs of the tile that exist.
-            let inside: [Range<usize>; 2] =
-                core::array::from_fn(|a| usize::from(corner[a] == 0)..T::INPUTS.min(shape.plane[a] + 1 - corner[a]));
+            let inside: [Range<usize>; 2] = [0, 1].map(
+                #[inline(always)]
+                |a| {
+                    let before = part.before(a);
+                    before.saturating_sub(corner[a])..T::INPUTS.min(shape.plane[a] + before - corner[a])
+                },
+            );
+            let from = [0, 1].map(
+                #[inline(always)]
+                |a| corner[a].wrapping_sub(part.before(a)),
+            );
             let whole = inside.iter().all(|inside| *inside == (0..T::INPUTS));
-            for stored in 0..part.layers.len() + 2 * halo {
+            for stored in 0..block.layers.len() + 2 * halo {
                 let to = (i * layout.stored + stored) * shape.channels;
-                let layer = (part.layers.start + stored).wrapping_sub(halo);
+                let layer = (block.layers.start + stored).wrapping_sub(halo);
                 if layer >= shape.layers {
                     for point in 0..shape.scheme.points() {
                         self.scratch[point * layout.input + to..][..shape.channels].fill(0.0);
                     }
                 } else if whole {
-                    self.transform::<S, T, true>(s, layout.input, corner, layer, &inside, to);
+                    self.transform::<S, T, true>(s, layout.input, from, layer, &inside, to);
                 } else {
-                    self.transform::<S, T, false>(s, layout.input, corner, layer, &inside, to);
+                    self.transform::<S, T, false>(s, layout.input, from, layer, &inside, to);
                 }
             }
         }
     }
 
-    /// Transforms all channels of one tile in one layer to `to` of every point. `WHOLE` says that all inputs exist.
+    /// Transforms all channels of one tile in one layer to `to` of every point. `from` is the first input of the tile, which may
+    /// lie outside the plane. `WHOLE` says that all inputs exist.
     #[inline(always)]
     fn transform<S: Simd, T: Transform, const WHOLE: bool>(
         &mut self,
         s: S,
         distance: usize,
-        corner: [usize; 2],
+        from: [usize; 2],
         layer: usize,
         inside: &[Range<usize>; 2],
         to: usize,
@@ -205,8 +222,8 @@ impl Run<'_> {
         let line = shape.plane[1] * step;
         // Of the input at (row, column): may lie outside where that does not exist.
         let start = |i: usize, j: usize| {
-            let from = (corner[0] + i).wrapping_sub(1).wrapping_mul(line);
-            from.wrapping_add((corner[1] + j).wrapping_sub(1).wrapping_mul(step)).wrapping_add(layer * shape.channels)
+            let row = from[0].wrapping_add(i).wrapping_mul(line);
+            row.wrapping_add(from[1].wrapping_add(j).wrapping_mul(step)).wrapping_add(layer * shape.channels)
         };
         let [rows, columns] = inside;
         let last = start(rows.end - 1, columns.end - 1) + shape.channels;
@@ -241,22 +258,23 @@ impl Run<'_> {
 
     /// Multiplies and sums at every point: `[point][panel][tile][layer][16]`.
     #[inline(always)]
-    fn products<S: Simd>(&mut self, s: S, layout: &Layout, part: &Part, columns: &Range<usize>) {
+    fn products<S: Simd>(&mut self, s: S, layout: &Layout, block: &Block, part: &Part, columns: &Range<usize>) {
         let shape = self.args.shape;
         let mut starts = [0; ROWS];
         let mut rows = 0;
-        for tile in 0..part.tiles.len() {
-            for layer in 0..part.layers.len() {
-                starts[rows] = (tile * layout.stored + layer) * shape.channels;
+        for tile in 0..block.tiles.len() {
+            for layer in 0..block.layers.len() {
+                starts[rows] = (tile * layout.stored + layer + part.first[2]) * shape.channels;
                 rows += 1;
             }
         }
         let starts = &starts[..rows];
+        let weights = &self.args.weights[part.index * shape.part_len()..];
         let panels = columns.start / LANES..columns.end.div_ceil(LANES);
         let (inputs, sums) = self.scratch.split_at_mut(shape.scheme.points() * layout.input);
         let points = inputs.chunks_exact(layout.input).zip(sums.chunks_exact_mut(layout.sums));
         for (point, (inputs, sums)) in points.enumerate() {
-            let point = Point { shape, weights: &self.args.weights[point * shape.point_len()..], inputs, starts };
+            let point = Point { shape, weights: &weights[point * shape.point_len()..], inputs, starts };
             let (sums, _) = sums.as_chunks_mut();
             let most = DEPTH / S::TILE.panels.min(panels.len());
             for k in (0..shape.depth()).step_by(most) {
@@ -278,17 +296,24 @@ impl Run<'_> {
 
     /// Transforms the sums back and writes the outputs.
     #[inline(always)]
-    fn outputs<S: Simd, T: Transform>(&mut self, s: S, layout: &Layout, part: &Part, columns: &Range<usize>) {
+    fn outputs<S: Simd, T: Transform>(
+        &mut self,
+        s: S,
+        layout: &Layout,
+        block: &Block,
+        part: &Part,
+        columns: &Range<usize>,
+    ) {
         let shape = self.args.shape;
         let mut end = self.args.end();
         let target = Linear { first: shape.positions(&self.tile_rows).start, stride: self.stride };
         let sums = &self.scratch[shape.scheme.points() * layout.input..];
-        let rows = part.tiles.len() * part.layers.len();
+        let rows = block.tiles.len() * block.layers.len();
         let mut row = 0;
-        for tile in part.tiles.clone() {
+        for tile in block.tiles.clone() {
             let corner = self.corner(tile);
             let inside = [T::OUTPUTS.min(shape.plane[0] - corner[0]), T::OUTPUTS.min(shape.plane[1] - corner[1])];
-            for layer in part.layers.clone() {
+            for layer in block.layers.clone() {
                 for column in (0..columns.len()).step_by(LANES) {
                     let from = column * rows + row * LANES;
                     assert!((shape.scheme.points() - 1) * layout.sums + from + LANES <= sums.len(), "no such sums");
@@ -309,7 +334,7 @@ impl Run<'_> {
                     for i in 0..inside[0] {
                         let line = T::output(s, half[i]);
                         for j in 0..inside[1] {
-                            let position = ((corner[0] + i) * shape.plane[1] + corner[1] + j) * shape.layers + layer;
+                            let position = part.position(&shape, [corner[0] + i, corner[1] + j, layer]);
                             let offsets = &[target.offset(position)];
                             let (row, target) = (position, &target);
                             let place = Place { column, columns: shape.columns, row, target, offsets };

@@ -24,9 +24,13 @@ struct Call {
 }
 
 pub(crate) fn draw(draw: &mut Draw) -> Option<impl Case + use<>> {
-    let scheme = if draw.flag() { Scheme::Two } else { Scheme::Four };
+    let scheme = [Scheme::Two, Scheme::Three, Scheme::Four][draw.extent(0, 2)];
     let plane = [draw.extent(1, 9), draw.extent(1, 9)];
-    let (layers, layer_taps) = if draw.flag() { (draw.extent(1, 4), 3) } else { (1, 1) };
+    let (layers, layer_taps) = match scheme {
+        Scheme::Three => (draw.extent(1, 4), 2),
+        _ if draw.flag() => (draw.extent(1, 4), 3),
+        _ => (1, 1),
+    };
     let channels = 16 * draw.extent(1, 5);
     let one = Shape { plane, layers, layer_taps, channels, columns: 1, scheme };
     let columns = draw.columns(one.multiply_adds() as usize)?;
@@ -39,7 +43,7 @@ pub(crate) fn draw(draw: &mut Draw) -> Option<impl Case + use<>> {
         bias: draw.values(columns.next_multiple_of(16)),
         relu: draw.flag(),
         added: draw.values(if joins > 1 { span(shape.rows(), added_stride, columns) } else { 0 }),
-        input: draw.values(shape.rows() * channels),
+        input: draw.values(shape.inputs() * channels),
         before: draw.values(span(shape.positions(&tile_rows).len(), stride, columns)),
         shape,
         tile_rows,
@@ -73,18 +77,28 @@ impl Case for Call {
     }
 }
 
-/// A bench whose units are rows of tiles, in multiply-adds of the direct convolution. The plane must be whole tiles high.
+/// A convolution.
 fn bench(name: &str, input: [usize; 3], kernel: [usize; 3], channels: usize, columns: usize) -> Bench {
     let padding = kernel.map(|taps| taps / 2);
     let geometry = Geometry { input, channels, kernel, stride: [1; 3], dilation: [1; 3], padding, output: input };
-    let shape = Shape::best(&geometry, columns, [1, 2]).expect("worth it");
-    let units = shape.tiles()[0];
+    rows_of_tiles(name, Shape::best(&geometry, columns, [1, 2]).expect("worth it"), geometry.depth())
+}
+
+/// A transposed convolution.
+fn doubled(name: &str, extent: [usize; 3], channels: usize, columns: usize) -> Bench {
+    let shape = Shape::best_deconv3d(extent, channels, columns, [1, 2]).expect("worth it");
+    rows_of_tiles(name, shape, 8 * channels)
+}
+
+/// A bench whose units are rows of tiles, as many as the plane has whole ones, in multiply-adds of direct sums of `depth` products.
+fn rows_of_tiles(name: &str, shape: Shape, depth: usize) -> Bench {
+    let columns = shape.columns;
+    let units = shape.plane[0] / shape.scheme.outputs();
     let each = shape.positions(&(0..1)).len();
-    assert_eq!(units * each, shape.rows(), "whole tiles");
-    let (input, weights) = (values(shape.rows() * channels, 1.0), values(shape.weights_len(), 0.01));
+    let (input, weights) = (values(shape.inputs() * shape.channels, 1.0), values(shape.weights_len(), 0.01));
     let (bias, mut scratch) = (values(columns.next_multiple_of(16), 1.0), values(shape.scratch_len(), 0.0));
     let read = 4 * (input.len() + weights.len());
-    Bench::new(name, [units, each * columns], each * geometry.depth() * columns, read, move |isa, tile_rows, out| {
+    Bench::new(name, [units, each * columns], each * depth * columns, read, move |isa, tile_rows, out| {
         let (input, weights, bias) = (&input[..], &weights[..], &bias[..]);
         let args = Winograd { shape, input, weights, bias, relu: true, residual: Residual::None };
         winograd(isa, &args, tile_rows, columns, out, &mut scratch);
@@ -100,5 +114,7 @@ pub(crate) fn benches() -> Vec<Bench> {
         bench("folded fpn level1 3x3 512-128", [1, 116, 200], plane, 512, 128),
         bench("level1 3x3x3 64", [100, 100, 8], cube, 64, 64),
         bench("refine0 3x3x3 32", [200, 200, 16], cube, 32, 32),
+        doubled("up_sample2 128-64", [50, 50, 4], 128, 64),
+        doubled("up_sample1 64-32", [100, 100, 8], 64, 32),
     ]
 }

@@ -17,39 +17,57 @@ impl Shape {
     /// longer in a direct sum than the multiply-adds alone; both transforms, 14 per number; the weights, which are
     /// read from far away, 8 per number. Winograd must save an eighth.
     pub fn best(geometry: &Geometry, columns: usize, room: [usize; 2]) -> Option<Self> {
-        let padded = columns.next_multiple_of(LANES) as u128;
-        let products = geometry.depth() as u128 * padded;
-        let direct = geometry.rows() as u128 * products * 9 / 8 + WEIGHT * products;
-        [Scheme::Two, Scheme::Four]
-            .into_iter()
-            .filter_map(|scheme| Self::of(geometry, columns, scheme))
+        let schemes = [Scheme::Two, Scheme::Four].into_iter();
+        let shapes = schemes.filter_map(|scheme| Self::of(geometry, columns, scheme));
+        Self::cheapest(shapes, room, geometry.rows() as u128, geometry.depth() as u128)
+    }
+
+    /// As [`Shape::best`], for the transposed convolution of [`crate::deconv3d`].
+    pub fn best_deconv3d(extent: [usize; 3], channels: usize, columns: usize, room: [usize; 2]) -> Option<Self> {
+        let shape = Self::of_deconv3d(extent, channels, columns)?;
+        Self::cheapest([shape].into_iter(), room, shape.inputs() as u128, 8 * channels as u128)
+    }
+
+    /// The cheapest of the shapes, unless direct sums are cheaper, of `rows` outputs of each part, each a sum of `depth` products.
+    fn cheapest(shapes: impl Iterator<Item = Self>, room: [usize; 2], rows: u128, depth: u128) -> Option<Self> {
+        let direct = |shape: &Self| {
+            let products = shape.parts() as u128 * depth * shape.padded();
+            rows * products * 9 / 8 + WEIGHT * products
+        };
+        shapes
             .filter(|shape| shape.accurate() && shape.modest(room))
             .map(|shape| (shape.cost(), shape))
             .min_by_key(|(cost, _)| *cost)
-            .filter(|(cost, _)| *cost <= direct / 8 * 7)
+            .filter(|(cost, shape)| *cost <= direct(shape) / 8 * 7)
             .map(|(_, shape)| shape)
+    }
+
+    /// Columns that are computed.
+    fn padded(&self) -> u128 {
+        self.columns.next_multiple_of(LANES) as u128
     }
 
     fn cost(&self) -> u128 {
         let [down, across] = self.tiles().map(|v| v as u128);
         let numbers = down * across * (self.layers * self.scheme.points()) as u128;
-        let (depth, columns) = (self.depth() as u128, self.columns.next_multiple_of(LANES) as u128);
-        numbers * (depth * columns * 5 / 4 + TRANSFORM * (self.channels as u128 + columns))
-            + WEIGHT * self.scheme.points() as u128 * depth * columns
+        let (parts, transforms) = (self.parts() as u128, (self.parts() / self.step()) as u128);
+        let sums = parts * self.depth() as u128 * self.padded();
+        numbers * (sums * 5 / 4 + TRANSFORM * (transforms * self.channels as u128 + parts * self.padded()))
+            + WEIGHT * self.scheme.points() as u128 * sums
     }
 
     /// Whether the error is at most twice that of a direct sum. F(4,3) amplifies the rounding of its transforms, beside which
     /// a direct sum of few products has little.
     pub fn accurate(&self) -> bool {
-        self.scheme == Scheme::Two || self.depth() >= 32
+        self.scheme != Scheme::Four || self.depth() >= 32
     }
 
     /// Whether the transformed weights, of which there are up to four times as many, take at most `room[0] / room[1]` times the memory
     /// of the maps that the convolution reads and writes: a network's memory follows its maps, and deep layers of small maps
     /// keep their direct sums.
     pub fn modest(&self, room: [usize; 2]) -> bool {
-        let maps = self.rows() as u128 * (self.channels + self.columns) as u128;
-        let per_point = self.depth() as u128 * self.columns.next_multiple_of(LANES) as u128;
+        let maps = self.inputs() as u128 * self.channels as u128 + self.rows() as u128 * self.columns as u128;
+        let per_point = self.parts() as u128 * self.depth() as u128 * self.padded();
         self.scheme.points() as u128 * per_point * room[1] as u128 <= maps * room[0] as u128
     }
 }
@@ -100,6 +118,24 @@ mod tests {
             Geometry { input, channels: 128, kernel, stride: [1; 3], dilation: [1; 3], padding, output: input };
         let chosen = [[1, 1], [1, 2], [1, 4]].map(|room| Shape::best(&geometry, 128, room).map(|shape| shape.scheme));
         assert_eq!(chosen, [Some(Scheme::Four), Some(Scheme::Two), None]);
+    }
+
+    #[test]
+    fn volumes_are_doubled_by_it_where_their_weights_are_few() {
+        for (extent, channels, columns, want) in [
+            ([100, 100, 8], 64, 32, true),
+            ([50, 50, 4], 128, 64, true),
+            ([52, 52, 4], 32, 16, true),
+            ([25, 25, 2], 256, 128, false),
+            ([100, 100, 8], 40, 32, false),
+        ] {
+            let shape = Shape::best_deconv3d(extent, channels, columns, [1, 2]);
+            assert_eq!(
+                shape.map(|shape| shape.scheme),
+                want.then_some(Scheme::Three),
+                "{extent:?} {channels}-{columns}"
+            );
+        }
     }
 
     #[test]

@@ -1,5 +1,6 @@
 use super::*;
 use crate::conv::{Conv, conv};
+use crate::deconv3d::{Deconv3d, deconv3d};
 use crate::matmul::layout::{pack, packed_len};
 use crate::matmul::{Panels, Product, SCRATCH};
 use crate::testing::{
@@ -9,6 +10,7 @@ use crate::testing::{
 use proptest::prelude::*;
 use proptest::test_runner::{Config, TestRunner};
 
+/// Those of a convolution.
 const SCHEMES: [Scheme; 2] = [Scheme::Two, Scheme::Four];
 
 fn image(plane: [usize; 2], channels: usize, columns: usize, scheme: Scheme) -> Shape {
@@ -17,6 +19,10 @@ fn image(plane: [usize; 2], channels: usize, columns: usize, scheme: Scheme) -> 
 
 fn volume(plane: [usize; 2], layers: usize, channels: usize, columns: usize, scheme: Scheme) -> Shape {
     Shape { plane, layers, layer_taps: 3, channels, columns, scheme }
+}
+
+fn doubled(plane: [usize; 2], layers: usize, channels: usize, columns: usize) -> Shape {
+    Shape::of_deconv3d([plane[0], plane[1], layers], channels, columns).expect("channels in sixteens")
 }
 
 /// The direct convolution that computes the same.
@@ -33,7 +39,7 @@ fn geometry(shape: &Shape) -> Geometry {
 struct Case {
     shape: Shape,
     input: Vec<f32>,
-    /// `[9 taps of the plane, taps of the layers, channels, columns]`.
+    /// `[parts, taps of the plane, taps of the layers, channels, columns]`.
     natural: Vec<f32>,
     weights: Vec<f32>,
     /// Padded with NaN, which must not show.
@@ -48,9 +54,9 @@ impl Case {
     fn new(shape: Shape, joins: Joins, relu: bool, seed: u64, fill: Fill) -> Self {
         let mut rng = Rng::new(seed);
         let outputs = shape.rows() * shape.columns;
-        let natural = fill(&mut rng, 9 * shape.depth() * shape.columns);
+        let natural = fill(&mut rng, shape.parts() * shape.direct_depth() * shape.columns);
         let bias = pad_rows(&fill(&mut rng, shape.columns), shape.columns, f32::NAN);
-        let input = fill(&mut rng, shape.rows() * shape.channels);
+        let input = fill(&mut rng, shape.inputs() * shape.channels);
         let added = fill(&mut rng, shape.rows() * (shape.columns + 1));
         let before = fill(&mut rng, outputs);
         Self { shape, input, natural, weights: vec![], bias, joins, relu, added, before }.packed()
@@ -59,8 +65,9 @@ impl Case {
     /// With transformed weights.
     fn packed(mut self) -> Self {
         self.weights = vec![f32::NAN; self.shape.weights_len()];
-        let columns = self.shape.columns;
-        self.shape.pack(|k, n| f64::from(self.natural[k * columns + n]), &mut self.weights);
+        let (depth, columns) = (self.shape.direct_depth(), self.shape.columns);
+        let weight = |part, k, n| f64::from(self.natural[(part * depth + k) * columns + n]);
+        self.shape.pack(weight, &mut self.weights);
         self
     }
 
@@ -95,11 +102,22 @@ impl Case {
 
     /// The direct kernel's result.
     fn direct(&self, isa: Isa) -> Vec<f32> {
-        let (columns, geometry) = (self.shape.columns, geometry(&self.shape));
-        let depth = geometry.depth();
-        let mut weights = vec![0.0; packed_len(depth, columns)];
-        pack(depth, columns, |k, n| self.natural[k * columns + n], &mut weights);
+        let (depth, columns) = (self.shape.direct_depth(), self.shape.columns);
+        let part_len = packed_len(depth, columns);
+        let mut weights = vec![0.0; self.shape.parts() * part_len];
+        for (part, weights) in weights.chunks_exact_mut(part_len).enumerate() {
+            pack(depth, columns, |k, n| self.natural[(part * depth + k) * columns + n], weights);
+        }
         let weights = Panels::F32(&weights);
+        if self.shape.scheme == Scheme::Three {
+            let Shape { plane: [x, y], layers, channels, .. } = self.shape;
+            let (input, bias, relu) = (&self.input[..], &self.bias[..], self.relu);
+            let args = Deconv3d { extent: [x, y, layers], channels, columns, input, weights, bias, relu, add: None };
+            let mut out = vec![f32::NAN; self.shape.rows() * columns];
+            deconv3d(isa, &args, 0..2 * x, &mut out, &mut [f32::NAN; SCRATCH]);
+            return out;
+        }
+        let geometry = geometry(&self.shape);
         let product = Product { weights, bias: &self.bias, depth, columns, relu: self.relu, residual: self.residual() };
         let mut out = self.before.clone();
         let args = Conv { geometry, input: &self.input, product };
@@ -107,12 +125,17 @@ impl Case {
         out
     }
 
-    /// The formula of the direct convolution in f64.
+    /// The formula of the direct convolution, transposed or not, in f64.
     fn naive(&self) -> Vec<f64> {
-        let Shape { plane: [h, w], layers, layer_taps, channels, columns, .. } = self.shape;
+        let Shape { plane: [h, w], layers, layer_taps, channels, columns, scheme } = self.shape;
+        let (taps, step) = (scheme.taps(), if scheme == Scheme::Three { 2 } else { 1 });
         let mut out = Vec::new();
         for (row, n) in (0..self.shape.rows()).flat_map(|row| (0..columns).map(move |n| (row, n))) {
-            let [y, x, z] = [row / layers / w, row / layers % w, row % layers];
+            let out_at =
+                [row / (layers * step) / (w * step), row / (layers * step) % (w * step), row % (layers * step)];
+            let part = out_at.iter().fold(0, |part, at| part * step + at % step);
+            // One beyond the first input under the taps.
+            let [y, x, z] = out_at.map(|at| if step == 2 { at / 2 + at % 2 } else { at });
             let mut sum = f64::from(self.bias[n]);
             let added = f64::from(self.added[row * (columns + 1) + n]);
             match self.joins {
@@ -120,14 +143,16 @@ impl Case {
                 Joins::Before => sum += added,
                 _ => {}
             }
-            for tap in 0..9 * layer_taps {
+            for tap in 0..taps * taps * layer_taps {
                 let (plane, layer) = (tap / layer_taps, tap % layer_taps);
-                let [y, x, z] = [y + plane / 3, x + plane % 3, z + layer + usize::from(layer_taps == 1)];
+                let [y, x, z] = [y + plane / taps, x + plane % taps, z + layer + usize::from(layer_taps == 1)];
                 if (1..=h).contains(&y) && (1..=w).contains(&x) && (1..=layers).contains(&z) {
                     let position = ((y - 1) * w + x - 1) * layers + z - 1;
                     for c in 0..channels {
                         sum += f64::from(self.input[position * channels + c])
-                            * f64::from(self.natural[(tap * channels + c) * columns + n]);
+                            * f64::from(
+                                self.natural[(part * self.shape.direct_depth() + tap * channels + c) * columns + n],
+                            );
                     }
                 }
             }
@@ -159,6 +184,16 @@ fn table() -> Vec<(&'static str, Shape)> {
             ("a volume, two blocks of k", volume([2, 5], 2, 144, 16, scheme)),
         ]);
     }
+    table.extend([
+        ("one voxel doubled", doubled([1, 1], 1, 16, 1)),
+        ("less than a tile doubled", doubled([2, 1], 3, 16, 16)),
+        ("one tile doubled", doubled([3, 3], 2, 32, 17)),
+        ("a tile and one more doubled", doubled([4, 7], 4, 32, 33)),
+        ("two blocks of layers doubled", doubled([3, 4], LAYERS + 2, 16, 5)),
+        ("two blocks of columns doubled", doubled([3, 2], 2, 16, 131)),
+        ("several blocks of tiles doubled", doubled([13, 17], 2, 16, 15)),
+        ("two blocks of k doubled", doubled([2, 5], 2, 208, 16)),
+    ]);
     table
 }
 
@@ -240,7 +275,57 @@ fn by_hand() {
 }
 
 #[test]
+fn doubled_by_hand() {
+    // Along the first axis the voxels 1 and 10 with the taps 1, 2, 3, 4 of the transposed convolution, of which an output with
+    // parity p meets 4 - p - 2t: the outputs are 2, 3 + 10, 4 + 20, 30, in the first line along the others.
+    let mut case = Case::new(doubled([2, 1], 1, 16, 1), Joins::Nowhere, false, 0, Rng::ordinary);
+    case.input.fill(0.0);
+    case.natural.fill(0.0);
+    (case.input[0], case.input[16], case.bias[0]) = (1.0, 10.0, 0.0);
+    for (parity, tap) in (0..2).flat_map(|parity| (0..2).map(move |tap| (parity, tap))) {
+        // The tap along y and z that meets the only voxel at their first output is the second one.
+        let k = (tap * 4 + 3) * 16;
+        case.natural[parity * 4 * 8 * 16 + k] = (4 - parity - 2 * tap) as f32;
+    }
+    let case = case.packed();
+    for isa in Isa::available() {
+        let found: Vec<f32> = case.all(isa).chunks_exact(4).map(|line| line[0]).collect();
+        assert_eq!(found, [2.0, 13.0, 24.0, 30.0], "{}", isa.name());
+    }
+}
+
+#[test]
+fn a_number_that_is_not_finite_spoils_of_every_parity_what_its_tiles_make_of_it() {
+    let mut case = Case::new(doubled([7, 8], 3, 16, 3), Joins::Nowhere, false, 8, Rng::ordinary);
+    let sound = case.all(Isa::Scalar);
+    let of = [2, 3, 1];
+    case.input[((of[0] * 8 + of[1]) * 3 + of[2]) * 16 + 5] = f32::NAN;
+    let want = case.all(Isa::Scalar);
+    for (i, (v, sound)) in want.iter().zip(&sound).enumerate() {
+        let at = [i / 3 / 6 / 16, i / 3 / 6 % 16, i / 3 % 6];
+        let reached = (0..3).all(|a| {
+            let (parity, at) = (at[a] % 2, at[a] / 2);
+            // Along the plane a tile has four inputs, of which the outer ones meet one output each; along the layers two.
+            let (first, inner) = if a < 2 { (at / 3 * 3, at % 3) } else { (at, 0) };
+            match (of[a] + 1).checked_sub(first + parity) {
+                Some(0) => inner == 0,
+                Some(1) => true,
+                Some(2) => a < 2,
+                Some(3) => a < 2 && inner == 2,
+                _ => false,
+            }
+        });
+        assert_eq!(v.is_nan(), reached, "{at:?}: {v}");
+        assert!(reached || v.to_bits() == sound.to_bits(), "{at:?}: {v}");
+    }
+    for isa in Isa::available() {
+        assert_same_bits(&case.all(isa), &want, isa.name());
+    }
+}
+
+#[test]
 fn the_order_of_a_chain_shows() {
+    // One tap across layers: reversed channels are reversed k.
     for (name, shape) in table().into_iter().filter(|(_, shape)| shape.layer_taps == 1 && shape.rows() > 9) {
         let mut case = Case::new(shape, Joins::Nowhere, false, 7, Rng::ordinary);
         let want = case.all(Isa::Scalar);
@@ -274,14 +359,15 @@ fn any_shape_and_any_split_gives_the_scalar_bits() {
     let shape = (
         [1usize..14, 1usize..14],
         1usize..5,
-        prop::sample::select(vec![1usize, 3]),
+        prop::sample::select(vec![1usize, 2, 3]),
         prop::sample::select(vec![16usize, 32, 48, 64, 80]),
         1usize..36,
         prop::sample::select(SCHEMES.to_vec()),
     )
-        .prop_map(|(plane, layers, layer_taps, channels, columns, scheme)| {
-            let layers = if layer_taps == 1 { 1 } else { layers };
-            Shape { plane, layers, layer_taps, channels, columns, scheme }
+        .prop_map(|(plane, layers, layer_taps, channels, columns, scheme)| match layer_taps {
+            1 => image(plane, channels, columns, scheme),
+            2 => doubled(plane, layers, channels, columns),
+            _ => volume(plane, layers, channels, columns, scheme),
         });
     let run = |(shape, joins, relu, seed, split): (Shape, _, _, u64, usize)| {
         let case = Case::new(shape, joins, relu, seed, Rng::fill_of(seed));
@@ -323,6 +409,9 @@ fn errors_are_at_most_twice_those_of_direct_sums() {
         shapes.push(image([16, 16], channels, 16, four));
     }
     shapes.extend([volume([8, 8], 4, 16, 16, four), volume([8, 8], 4, 32, 16, four), volume([8, 8], 2, 64, 16, four)]);
+    for channels in [16, 32, 64, 128, 256] {
+        shapes.push(doubled([6, 6], 2, channels, 16));
+    }
     for shape in shapes {
         assert!(shape.accurate(), "{shape:?}");
         let mut case = Case::new(shape, Joins::Nowhere, false, 11, Rng::ordinary);
@@ -366,6 +455,12 @@ fn no_layers() {
 #[should_panic(expected = "2 taps across layers")]
 fn two_taps_across_layers() {
     broken(|case| case.shape.layer_taps = 2);
+}
+
+#[test]
+#[should_panic(expected = "3 taps across layers")]
+fn three_taps_of_a_transposed_convolution() {
+    broken(|case| (case.shape.layer_taps, case.shape.scheme) = (3, Scheme::Three));
 }
 
 #[test]

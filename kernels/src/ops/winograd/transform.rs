@@ -1,8 +1,8 @@
-//! The three transforms of both schemes, and how weights are stored.
+//! The three transforms of every scheme, and how weights are stored.
 //!
 //! With points p, the polynomial product of Toom and Cook transposed (Winograd 1980; Lavin and Gray, arXiv 1509.09308) gives
-//! `y = A^T [(G w) * (B^T d)]`. `F(2,3)` has the points 0, 1, -1 and infinity; `F(4,3)` has 0, a, -a, b, -b and infinity with
-//! a = 5/8 and b = 25/16. Their product is close to 1, which keeps the rounding error near the lowest that any four symmetric
+//! `y = A^T [(G w) * (B^T d)]`. `F(2,3)` and `F(3,2)` have the points 0, 1, -1 and infinity, and so the same B; `F(4,3)` has
+//! 0, a, -a, b, -b and infinity with a = 5/8 and b = 25/16. Their product is close to 1, which keeps the rounding error near the lowest that any four symmetric
 //! points give (Barabasz et al., arXiv 1803.10986, on why), and all numbers in A and B are exact in f32.
 
 use super::Shape;
@@ -32,6 +32,9 @@ const fn powers(x: f32) -> [f32; 3] {
 pub enum Scheme {
     /// F(2,3): 2 x 2 outputs from 4 x 4 inputs, with 16 multiplications per channel in place of 36.
     Two,
+    /// F(3,2): 3 x 3 outputs of one parity of a transposed convolution from 4 x 4 inputs, with 16 multiplications per
+    /// channel in place of 36.
+    Three,
     /// F(4,3): 4 x 4 outputs from 6 x 6 inputs, with 36 multiplications per channel in place of 144.
     Four,
 }
@@ -41,13 +44,22 @@ impl Scheme {
     pub const fn outputs(self) -> usize {
         match self {
             Scheme::Two => 2,
+            Scheme::Three => 3,
             Scheme::Four => 4,
+        }
+    }
+
+    /// Taps along an axis of the plane.
+    pub const fn taps(self) -> usize {
+        match self {
+            Scheme::Two | Scheme::Four => 3,
+            Scheme::Three => 2,
         }
     }
 
     /// Inputs of a tile along an axis.
     pub const fn inputs(self) -> usize {
-        self.outputs() + 2
+        self.outputs() + self.taps() - 1
     }
 
     /// Points of a tile.
@@ -55,10 +67,11 @@ impl Scheme {
         self.inputs() * self.inputs()
     }
 
-    /// G: the weight of each of three taps at each point.
+    /// G: the weight of each tap at each point.
     fn weights(self) -> [[f64; 3]; SIDE] {
         match self {
             Scheme::Two => [[1.0, 0.0, 0.0], [0.5, 0.5, 0.5], [0.5, -0.5, 0.5], [0.0, 0.0, 1.0], [0.0; 3], [0.0; 3]],
+            Scheme::Three => [[1.0, 0.0, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 1.0, 0.0], [0.0; 3], [0.0; 3]],
             Scheme::Four => {
                 let [a, b] = [A, B].map(|p| f64::from(p[0]));
                 let points = [0.0, a, -a, b, -b];
@@ -76,7 +89,7 @@ impl Scheme {
     #[inline(always)]
     pub(super) fn input(self, d: [f32; SIDE]) -> [f32; SIDE] {
         match self {
-            Scheme::Two => [d[0] - d[2], d[1] + d[2], d[2] - d[1], d[3] - d[1], 0.0, 0.0],
+            Scheme::Two | Scheme::Three => [d[0] - d[2], d[1] + d[2], d[2] - d[1], d[3] - d[1], 0.0, 0.0],
             Scheme::Four => {
                 let (even_a, odd_a) = ((-B[1]).mul_add(d[2], d[4]), (-B[1]).mul_add(d[1], d[3]));
                 let (even_b, odd_b) = ((-A[1]).mul_add(d[2], d[4]), (-A[1]).mul_add(d[1], d[3]));
@@ -97,6 +110,10 @@ impl Scheme {
     pub(super) fn output(self, m: [f32; SIDE]) -> [f32; SIDE] {
         match self {
             Scheme::Two => [(m[0] + m[1]) + m[2], (m[1] - m[2]) + m[3], 0.0, 0.0, 0.0, 0.0],
+            Scheme::Three => {
+                let sum = m[1] + m[2];
+                [m[0] + sum, m[1] - m[2], sum + m[3], 0.0, 0.0, 0.0]
+            }
             Scheme::Four => {
                 let (even_a, odd_a) = (m[1] + m[2], m[1] - m[2]);
                 let (even_b, odd_b) = (m[3] + m[4], m[3] - m[4]);
@@ -142,6 +159,23 @@ impl Transform for Two {
     }
 }
 
+pub(super) struct Three;
+
+impl Transform for Three {
+    const SCHEME: Scheme = Scheme::Three;
+
+    #[inline(always)]
+    fn input<S: Simd>(s: S, d: [S::V; SIDE]) -> [S::V; SIDE] {
+        Two::input(s, d)
+    }
+
+    #[inline(always)]
+    fn output<S: Simd>(s: S, m: [S::V; SIDE]) -> [S::V; SIDE] {
+        let sum = s.add(m[1], m[2]);
+        [s.add(m[0], sum), s.sub(m[1], m[2]), s.add(sum, m[3]), m[3], m[4], m[5]]
+    }
+}
+
 pub(super) struct Four;
 
 impl Transform for Four {
@@ -180,6 +214,11 @@ impl Transform for Four {
 }
 
 impl Shape {
+    /// Products of an output that is computed directly.
+    pub fn direct_depth(&self) -> usize {
+        self.scheme.taps() * self.scheme.taps() * self.depth()
+    }
+
     /// Products per output and point.
     pub fn depth(&self) -> usize {
         self.layer_taps * self.channels
@@ -190,34 +229,46 @@ impl Shape {
         packed_len(self.depth(), self.columns)
     }
 
-    /// Numbers that the transformed weights take.
-    pub fn weights_len(&self) -> usize {
+    /// Numbers that the transformed weights of one part take.
+    pub(super) fn part_len(&self) -> usize {
         self.scheme.points() * self.point_len()
     }
 
-    /// Transforms the weights of the convolution, in f64, and packs them: for each point, row by row, a matrix as
+    /// Numbers that the transformed weights take.
+    pub fn weights_len(&self) -> usize {
+        self.parts() * self.part_len()
+    }
+
+    /// Transforms the weights, in f64, and packs them: for each part, for each point, row by row, a matrix as
     /// [`crate::panels`] stores it, with k over (taps of the layers, channels).
     ///
-    /// `w(k, n)` is the weight that [`crate::conv`] has for output channel `n` at k, over (9 taps of the plane, taps of the
-    /// layers, channels).
+    /// `w(part, k, n)` is the weight that [`crate::conv`] has for output channel `n` at k, over (taps of the plane, taps of
+    /// the layers, channels); of a transposed convolution, the one that [`crate::deconv3d`] has for the parity `part`.
     ///
     /// # Panics
     /// If `out` is not [`Shape::weights_len`] long.
-    pub fn pack(&self, w: impl Fn(usize, usize) -> f64, out: &mut [f32]) {
+    pub fn pack(&self, w: impl Fn(usize, usize, usize) -> f64, out: &mut [f32]) {
         assert_eq!(out.len(), self.weights_len(), "transformed weights have another size");
         let (depth, side, points) = (self.depth(), self.scheme.inputs(), self.scheme.weights());
+        let taps = self.scheme.taps();
         out.fill(0.0);
-        for n in 0..self.columns {
-            for k in 0..depth {
-                let taps: [[f64; 3]; 3] =
-                    core::array::from_fn(|i| core::array::from_fn(|j| w((i * 3 + j) * depth + k, n)));
-                for (point, out) in out.chunks_exact_mut(self.point_len()).enumerate() {
-                    let (rows, columns) = (points[point / side], points[point % side]);
-                    let mut sum = 0.0;
-                    for (taps, row) in taps.iter().zip(rows) {
-                        sum += row * (taps[0] * columns[0] + taps[1] * columns[1] + taps[2] * columns[2]);
+        for (part, out) in out.chunks_exact_mut(self.part_len()).enumerate() {
+            for n in 0..self.columns {
+                for k in 0..depth {
+                    let square: [[f64; 3]; 3] = core::array::from_fn(|i| {
+                        core::array::from_fn(|j| match i.max(j) < taps {
+                            true => w(part, (i * taps + j) * depth + k, n),
+                            false => 0.0,
+                        })
+                    });
+                    for (point, out) in out.chunks_exact_mut(self.point_len()).enumerate() {
+                        let (rows, columns) = (points[point / side], points[point % side]);
+                        let mut sum = 0.0;
+                        for (taps, row) in square.iter().zip(rows) {
+                            sum += row * (taps[0] * columns[0] + taps[1] * columns[1] + taps[2] * columns[2]);
+                        }
+                        out[packed_index(depth, k, n)] = sum as f32;
                     }
-                    out[packed_index(depth, k, n)] = sum as f32;
                 }
             }
         }
