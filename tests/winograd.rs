@@ -167,7 +167,9 @@ fn errors_of_every_operation_are_at_most_twice_those_of_direct_sums() {
         let [exact, filtered] = models(&network, Precision::F32);
         let graph = filtered.graph(false, Results::default());
         let chosen = graph.operations.iter().filter(|o| matches!(o.op, Op::Winograd(_) | Op::WinogradDeconv(_)));
-        let kinds: BTreeMap<String, &str> = chosen.map(|o| (o.name.clone(), o.op.description().kind())).collect();
+        // One network's operations of a kind are enough: exact sums take a while.
+        let kinds = chosen.map(|o| (o.name.clone(), o.op.description().kind())).filter(|(_, kind)| !met.contains(kind));
+        let kinds: BTreeMap<String, &str> = kinds.collect();
         let names: Vec<String> = kinds.keys().cloned().collect();
         let [direct, here] = [&exact, &filtered].map(|model| errors(model, &exact, &names));
         let table: Vec<String> = names

@@ -6,7 +6,7 @@ use super::ops::{BatchNorm, Conv, Deconv, Gather, Op, Winograd, WinogradDeconv};
 use super::recipe::{ConvNames, Recipe};
 use super::tensor::TensorId;
 use voxcast_kernels::conv::Geometry;
-use voxcast_kernels::winograd::Shape;
+use voxcast_kernels::winograd::{Reads, Shape};
 
 impl Graph {
     /// Moves every batch norm into the convolution whose result it reads: scale into the weights, shift into the bias.
@@ -61,21 +61,19 @@ impl Graph {
     }
 
     /// Computes convolutions, transposed ones too, by Winograd's minimal filtering where [`Shape::best`] and
-    /// [`Shape::best_deconv3d`] say so: from their shapes alone. What they read and write, and all that surrounds them, stays. Nothing that folds convolutions may come after it.
-    ///
-    /// Transformed weights may take three times the memory of the maps where every camera's pass reads them, and half as much as
-    /// the maps where they are read once in a frame.
+    /// [`Shape::best_deconv3d`] say so: from their shapes alone, and from whether every camera's pass reads the weights. What they
+    /// read and write, and all that surrounds them, stays. Nothing that folds convolutions may come after it.
     #[must_use]
     pub fn use_winograd(mut self) -> Self {
         for (index, operation) in self.operations.iter_mut().enumerate() {
-            let room = if index < self.camera_operations { [3, 1] } else { [1, 2] };
+            let reads = if index < self.camera_operations { Reads::PerCamera } else { Reads::PerFrame };
             let filtered: Option<Op> = match operation.op {
                 Op::Conv(Conv { geometry }) => {
-                    Shape::best(&geometry, operation.channels, room).map(|shape| Winograd { geometry, shape }.into())
+                    Shape::best(&geometry, operation.channels, reads).map(|shape| Winograd { geometry, shape }.into())
                 }
                 Op::Deconv(Deconv) => {
                     let x = &self.tensors[operation.inputs[0].0];
-                    Shape::best_deconv3d(x.extent, x.channels, operation.channels, room)
+                    Shape::best_deconv3d(x.extent, x.channels, operation.channels, reads)
                         .map(|shape| WinogradDeconv { shape }.into())
                 }
                 _ => None,

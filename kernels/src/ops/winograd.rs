@@ -32,6 +32,7 @@ mod choice;
 mod reference;
 mod transform;
 
+pub use choice::Reads;
 pub use transform::Scheme;
 
 use crate::conv::Geometry;

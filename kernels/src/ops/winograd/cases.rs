@@ -1,6 +1,6 @@
 //! [`super::winograd()`] with any arguments, and at the network's shapes.
 
-use super::{Scheme, Shape, Winograd, winograd};
+use super::{Reads, Scheme, Shape, Winograd, winograd};
 use crate::cases::draw::span;
 use crate::cases::{Bench, Case, Draw, Memory, Output, values};
 use crate::conv::Geometry;
@@ -81,12 +81,12 @@ impl Case for Call {
 fn bench(name: &str, input: [usize; 3], kernel: [usize; 3], channels: usize, columns: usize) -> Bench {
     let padding = kernel.map(|taps| taps / 2);
     let geometry = Geometry { input, channels, kernel, stride: [1; 3], dilation: [1; 3], padding, output: input };
-    rows_of_tiles(name, Shape::best(&geometry, columns, [1, 2]).expect("worth it"), geometry.depth())
+    rows_of_tiles(name, Shape::best(&geometry, columns, Reads::PerFrame).expect("worth it"), geometry.depth())
 }
 
 /// A transposed convolution.
 fn doubled(name: &str, extent: [usize; 3], channels: usize, columns: usize) -> Bench {
-    let shape = Shape::best_deconv3d(extent, channels, columns, [1, 2]).expect("worth it");
+    let shape = Shape::best_deconv3d(extent, channels, columns, Reads::PerFrame).expect("worth it");
     rows_of_tiles(name, shape, 8 * channels)
 }
 
