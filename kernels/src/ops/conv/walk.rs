@@ -10,6 +10,11 @@ const SHORT: usize = 3 * LANES;
 /// Runs of taps that are each given a pointer even where copied together they would be few elements.
 const FEW_RUNS: usize = 3;
 
+/// Ways of a first-level cache, at least.
+const WAYS: usize = 8;
+/// Distance of the addresses that share a set of it: a page, as long as sets are found before addresses are translated.
+const SET_BYTES: usize = 4096;
+
 /// How a convolution walks its input. The axes are depth, height, width.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Geometry {
@@ -125,6 +130,14 @@ impl<E: Copy + Default> Walk<'_, E> {
         let g = &self.geometry;
         let (len, count) = (g.run_taps() * g.channels, g.kernel.iter().product::<usize>() / g.run_taps());
         len < SHORT || count > FEW_RUNS && len * 8 < depth::<E>()
+    }
+
+    /// Whether a tile's rows lie so far apart that they fall into one set of the first-level cache, which has fewer ways than
+    /// the tile has rows: then they are copied to where they do not.
+    #[inline(always)]
+    fn collides<S: Simd>(&self) -> bool {
+        let distance = self.geometry.stride[2] * self.geometry.channels * size_of::<E>();
+        S::TILE.rows > WAYS && distance.is_multiple_of(SET_BYTES)
     }
 
     /// The `len` elements from `stretch` on within one run: where they start in the input, if all of them are in it,
@@ -264,7 +277,8 @@ impl<E: Copy + Default> Source for Walk<'_, E> {
     #[inline(always)]
     fn piece<'a, S: Simd>(&'a self, _: S, at: [usize; 3], stretch: Stretch, spare: &'a mut [E]) -> &'a [E] {
         let len = spare.len();
-        if stretch.skip + len <= self.geometry.run_taps() * self.geometry.channels
+        if !self.collides::<S>()
+            && stretch.skip + len <= self.geometry.run_taps() * self.geometry.channels
             && let Ok(start) = self.locate(at, stretch, len)
         {
             return &self.input[start..start + len];
