@@ -81,7 +81,7 @@ impl Description for WindowAttention {
 
     /// Windows have few keys, of few channels, and each pair of tokens an exponential.
     fn pace(&self) -> u64 {
-        8
+        12
     }
 
     fn tile(&self, _: &Site<'_>, _: Machine) -> usize {

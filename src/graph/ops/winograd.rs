@@ -29,6 +29,9 @@ pub struct WinogradDeconv {
     pub shape: Shape,
 }
 
+/// The transforms take as long as the products where there are few channels.
+const PACE: u64 = 2;
+
 impl Description for Winograd {
     fn kind(&self) -> &'static str {
         match (self.shape.layer_taps, self.shape.scheme) {
@@ -67,6 +70,10 @@ impl Description for Winograd {
         self.shape.multiply_adds().into()
     }
 
+    fn pace(&self) -> u64 {
+        PACE
+    }
+
     fn tile(&self, _: &Site<'_>, machine: Machine) -> usize {
         tile(&self.shape, machine)
     }
@@ -100,6 +107,10 @@ impl Description for WinogradDeconv {
 
     fn executed_multiply_adds(&self, _: &Site<'_>) -> u128 {
         self.shape.multiply_adds().into()
+    }
+
+    fn pace(&self) -> u64 {
+        PACE
     }
 
     fn tile(&self, _: &Site<'_>, machine: Machine) -> usize {
