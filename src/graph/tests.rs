@@ -174,7 +174,7 @@ fn winograd_saves_work_and_leaves_all_else() {
             assert_eq!(&restored, old);
         }
         let doubled = graph.operations.iter().filter(|o| matches!(o.op, Op::WinogradDeconv(_))).count();
-        assert_eq!(doubled, 2, "the two volumes with more voxels than weights");
+        assert_eq!(doubled, if name == "edge" { 1 } else { 2 }, "{name}: volumes with more voxels than weights");
         let count = |o: &Operation| matches!(o.op, Op::Winograd(_) | Op::WinogradDeconv(_));
         let all: u64 = graph.operations.iter().filter(|o| count(o)).map(|o| graph.multiply_adds(o)).sum();
         let left: u64 = graph.operations.iter().filter(|o| count(o)).map(|o| graph.executed_multiply_adds(o)).sum();

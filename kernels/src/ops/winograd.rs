@@ -82,7 +82,7 @@ const COLUMNS: usize = 128;
 const ROWS: usize = 96;
 /// Rows of a block, at least, if there are as many.
 const FEWEST: usize = 24;
-/// Numbers of transformed weights from which on a block has as many rows as it can: all weights are read for every block, and
+/// Numbers of a part's transformed weights from which on a block has as many rows as it can: all are read for every block, and
 /// from here on that takes longer than what a larger block does not find in the second-level cache.
 const MANY_WEIGHTS: usize = 1 << 20;
 /// f32 that the transformed inputs and the sums of a block may take beyond [`FEWEST`] rows: a second-level cache.

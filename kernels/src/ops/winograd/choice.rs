@@ -94,7 +94,8 @@ mod tests {
     fn best(input: [usize; 3], kernel: [usize; 3], channels: usize, columns: usize) -> Option<Scheme> {
         let padding = kernel.map(|k| k / 2);
         let geometry = Geometry { input, channels, kernel, stride: [1; 3], dilation: [1; 3], padding, output: input };
-        Shape::best(&geometry, columns, Reads::PerCamera).map(|shape| shape.scheme)
+        let reads = if kernel[0] == 1 { Reads::PerCamera } else { Reads::PerFrame };
+        Shape::best(&geometry, columns, reads).map(|shape| shape.scheme)
     }
 
     #[test]
@@ -107,8 +108,9 @@ mod tests {
             ([1, 32, 88], plane, 32, 32, Some(Scheme::Four)),
             ([200, 200, 16], cube, 32, 32, Some(Scheme::Four)),
             ([104, 104, 8], cube, 16, 16, Some(Scheme::Four)),
-            ([26, 26, 2], cube, 48, 48, Some(Scheme::Two)),
-            // Weights decide: those of F(4,3) would be more than three times the maps.
+            ([50, 50, 4], cube, 128, 128, Some(Scheme::Two)),
+            ([26, 26, 2], cube, 48, 48, None),
+            // Weights decide: those of F(4,3) would take more than they may beside the maps.
             ([1, 16, 44], plane, 256, 27, Some(Scheme::Four)),
             ([1, 29, 50], plane, 512, 512, Some(Scheme::Two)),
             ([1, 6, 17], plane, 256, 256, Some(Scheme::Two)),
