@@ -26,7 +26,8 @@
 //! 2. A head's output joins the next head's part in a copy of the window.
 //! 3. Queries lie amid zeros, so that no tap of their convolution needs a test.
 //! 4. The offsets are spread out to one row per token once per call; all windows of the call use them.
-//! 5. Lanes beyond the last token hold -inf for the maximum and 0 for the sum.
+//! 5. Lanes beyond the last token hold -inf for the maximum and 0 for the sum: their offsets are -inf, and their exponentials are
+//!    multiplied by 0.
 
 mod body;
 #[cfg(feature = "cases")]

@@ -27,7 +27,7 @@ impl WindowAttention<'_> {
                         *out = table[(t % width).abs_diff(uy)];
                     }
                 }
-                row[tokens..].fill(0.0);
+                row[tokens..].fill(f32::NEG_INFINITY);
             }
         }
         scratch.plane.fill(0.0);
@@ -87,8 +87,12 @@ impl WindowAttention<'_> {
         let (keys, values) = scratch.packed.split_at(packed_len(key_dim, tokens));
         product(s, Dense::new(scratch.query, pad, key_dim), keys, None, scratch.scores, padded);
         let offsets = &scratch.offsets[head * tokens * padded..(head + 1) * tokens * padded];
+        let last = tokens - (padded - LANES);
+        let mut exist = [0.0; LANES];
+        exist[..last].fill(1.0);
+        let exist = s.load(&exist);
         for (scores, offsets) in scratch.scores.chunks_exact_mut(padded).zip(offsets.chunks_exact(padded)) {
-            softmax(s, scores, offsets, tokens, self.scale());
+            softmax(s, scores, offsets, last, exist, self.scale());
         }
         product(s, Dense::new(scratch.scores, padded, tokens), values, None, scratch.head, pad);
         for (t, out) in scratch.head.chunks_exact(pad).enumerate() {
@@ -201,31 +205,33 @@ fn lanes_mut(x: &mut [f32]) -> &mut [f32; LANES] {
     x.first_chunk_mut().expect("rows are padded to whole vectors")
 }
 
-/// `scores`, the dot products of a token with the keys, become probabilities. Lanes from `tokens` on become 0.
+/// `scores`, the dot products of a token with the keys, become probabilities. Of the last 16 lanes `last` are keys: `exist` is
+/// 1 there and 0 beyond, where offsets are -inf.
 #[inline(always)]
-fn softmax<S: Simd>(s: S, scores: &mut [f32], offsets: &[f32], tokens: usize, scale: f32) {
-    let (offsets, _) = offsets.as_chunks();
-    for (score, offset) in scores.as_chunks_mut().0.iter_mut().zip(offsets) {
-        let y = s.mul_add(s.load(score), s.splat(scale), s.load(offset));
-        s.store(score, y);
-    }
-    scores[tokens..].fill(f32::NEG_INFINITY);
+fn softmax<S: Simd>(s: S, scores: &mut [f32], offsets: &[f32], last: usize, exist: S::V, scale: f32) {
+    let (scores, _) = scores.as_chunks_mut::<LANES>();
+    let (offsets, _) = offsets.as_chunks::<LANES>();
+    let end = scores.len() - 1;
     let mut max = s.splat(f32::NEG_INFINITY);
-    for score in scores.as_chunks().0 {
-        max = s.max(s.load(score), max);
+    for (i, (score, offset)) in scores.iter_mut().zip(offsets).enumerate() {
+        // What lies beyond the keys may be NaN: a query times the zeros of the panel.
+        let x = if i == end { s.load_part(&score[..last]) } else { s.load(score) };
+        let y = s.mul_add(x, s.splat(scale), s.load(offset));
+        s.store(score, y);
+        max = s.max(y, max);
     }
     let max = s.splat(tree_max(s.lanes(max)));
-    for score in scores.as_chunks_mut().0 {
-        let y = exp_v(s, s.sub(s.load(score), max));
-        s.store(score, y);
-    }
-    scores[tokens..].fill(0.0);
     let mut sum = s.splat(0.0);
-    for score in scores.as_chunks().0 {
-        sum = s.add(sum, s.load(score));
+    for (i, score) in scores.iter_mut().enumerate() {
+        let mut y = exp_v(s, s.sub(s.load(score), max));
+        if i == end {
+            y = s.mul(y, exist);
+        }
+        s.store(score, y);
+        sum = s.add(sum, y);
     }
     let sum = s.splat(tree_sum(s.lanes(sum)));
-    for score in scores.as_chunks_mut().0 {
+    for score in scores {
         let y = s.div(s.load(score), sum);
         s.store(score, y);
     }
