@@ -9,6 +9,8 @@ use core::ops::Range;
 const SHORT: usize = 3 * LANES;
 /// Runs of taps that are each given a pointer even where copied together they would be few elements.
 const FEW_RUNS: usize = 3;
+/// Where a block of the depth holds more runs than this, a run is not long.
+const RUNS_OF_BLOCK: usize = 8;
 
 /// How a convolution walks its input. The axes are depth, height, width.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -124,7 +126,7 @@ impl<E: Copy + Default> Walk<'_, E> {
     fn copies(&self) -> bool {
         let g = &self.geometry;
         let (len, count) = (g.run_taps() * g.channels, g.kernel.iter().product::<usize>() / g.run_taps());
-        len < SHORT || count > FEW_RUNS && len * 8 < depth::<E>()
+        len < SHORT || count > FEW_RUNS && len * RUNS_OF_BLOCK < depth::<E>()
     }
 
     /// The `len` elements from `stretch` on within one run: where they start in the input, if all of them are in it,
