@@ -93,8 +93,8 @@ impl Output {
     }
 }
 
-/// Every instruction set that tests can run here: those of the CPU, and on Linux with glibc `avx2-vnni` where the CPU has AVX2 without
-/// AVX-VNNI. Then a signal handler carries out its instruction, some ten thousand times slower than a CPU.
+/// Every instruction set that tests can run here: those of the CPU, and on Linux with glibc `avx2-vnni` where the CPU has
+/// AVX2 without AVX-VNNI. Then a signal handler carries out its instruction, some ten thousand times slower than a CPU.
 pub fn isas() -> impl Iterator<Item = Isa> {
     let isas = Isa::available();
     #[cfg(all(target_arch = "x86_64", target_os = "linux", target_env = "gnu"))]

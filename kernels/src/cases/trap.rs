@@ -1,6 +1,6 @@
-//! AVX-VNNI on a CPU that lacks it. Such a CPU refuses the instruction, Linux makes a signal of that, and the signal's handler
-//! carries the instruction out on the registers of what it interrupted. So the body of `avx2-vnni` runs as it is compiled, if
-//! slowly. The handler stays for as long as the process lives.
+//! AVX-VNNI on a CPU that lacks it. Such a CPU refuses the instruction, Linux makes a signal of that, and the signal's
+//! handler carries the instruction out on the registers of what it interrupted. So the body of `avx2-vnni` runs as it is
+//! compiled, if slowly. The handler stays for as long as the process lives.
 
 mod instruction;
 #[cfg(test)]
@@ -71,8 +71,8 @@ fn handle() {
     assert_eq!(done, 0, "no handler of illegal instructions: {}", std::io::Error::last_os_error());
 }
 
-/// Carries out the instruction that was refused, and those that follow as long as they are `vpdpbusd` too. Any other ends
-/// the process as without a handler.
+/// Carries out the instruction that was refused, and those that follow as long as they are `vpdpbusd` too. Any other
+/// instruction ends the process, as without a handler.
 extern "C" fn carry_out(_: libc::c_int, _: *mut libc::siginfo_t, context: *mut libc::c_void) {
     // SAFETY: the system passes the context of what was interrupted, which is the handler's until it returns.
     let context = unsafe { &mut (*context.cast::<libc::ucontext_t>()).uc_mcontext };
@@ -85,8 +85,8 @@ extern "C" fn carry_out(_: libc::c_int, _: *mut libc::siginfo_t, context: *mut l
         let bytes = (0..).map(|i| unsafe { code.add(i).read() });
         let Some(instruction) = Instruction::decode(bytes) else { break };
         context.gregs[libc::REG_RIP as usize] += i64::from(instruction.length);
-        // SAFETY: `area` is what the system stored of a CPU with AVX, and the instruction may read the memory that it names:
-        // where it may not, it would have ended the process, as reading here does.
+        // SAFETY: `area` is what the system stored of a CPU with AVX, and the instruction may read the memory that it
+        // names: where it may not, it would have ended the process, as reading here does.
         unsafe { execute(instruction, &mut vectors, &context.gregs) };
         count += 1;
     }
@@ -187,7 +187,7 @@ impl Vectors {
     unsafe fn set(&mut self, n: usize, value: [u8; 32]) {
         let &Parts { high, upper } = PARTS.get().expect("set before the handler");
         let halves: [[u8; 16]; 2] = bytemuck::cast(value);
-        // SAFETY: the caller promises the area, and there are sixteen registers. A flag tells whether there is a part of AVX-512.
+        // SAFETY: the caller promises the area, and there are sixteen registers. A flag tells whether AVX-512's part is there.
         unsafe {
             *self.part(LOW, LOW_STORED).add(n) = halves[0];
             *self.part(high, HIGH_STORED).add(n) = halves[1];

@@ -9,7 +9,7 @@ pub struct Avx2 {
     vnni: Option<AvxVnni>,
 }
 
-/// Proof that this CPU has AVX-VNNI: dot products of bytes in 256 bits. In tests a signal handler may have it in the CPU's place.
+/// Proof that this CPU has AVX-VNNI: dot products of bytes in 256 bits. In tests a signal handler may carry them out for it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct AvxVnni(());
 

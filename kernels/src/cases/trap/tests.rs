@@ -1,5 +1,5 @@
-//! The instruction against what its manual says, in every form of operands that compilers give it. On a CPU that has AVX-VNNI
-//! the CPU is compared; the decoder is tested everywhere.
+//! The instruction against what its manual says, in every form of operands that compilers give it. On a CPU that has
+//! AVX-VNNI the CPU is compared; the decoder is tested everywhere.
 
 use super::carried_out;
 use super::instruction::{Address, Base, Instruction, Operand};
@@ -52,8 +52,8 @@ fn by_hand() {
     assert_eq!(sums(i32::MIN, 200, -1), [i32::MAX - 799; 8]);
 }
 
-/// Functions that execute the instruction in some form, each with the registers of its sums and unsigned bytes, then with those of the
-/// signed bytes or their address.
+/// Functions that execute the instruction in some form, each with the registers of its sums and unsigned bytes, then with
+/// those of the signed bytes or their address.
 macro_rules! forms {
     (with $w:ident and $at:ident; $($name:ident: $code:literal, $sums:tt, $a:tt, [$($operand:tt)*];)*) => {
         $(
