@@ -5,12 +5,14 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
+use voxcast_kernels::Isa;
 use voxcast_kernels::cases::{Draw, Memory, REGISTRY, agree};
 
 fuzz_target!(|bytes: &[u8]| {
     let Some((&first, rest)) = bytes.split_first() else { return };
     let entry = &REGISTRY[usize::from(first) % REGISTRY.len()];
     if let Some(case) = (entry.draw)(&mut Draw::new(rest)) {
-        agree(entry.name, &*case, &[Memory::Heap]);
+        let isas: Vec<_> = Isa::available().collect();
+        agree(entry.name, &*case, &isas, &[Memory::Heap]);
     }
 });

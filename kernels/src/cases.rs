@@ -9,10 +9,14 @@ mod bench;
 pub(crate) mod draw;
 mod memory;
 pub(crate) mod right_i8;
+#[cfg(all(target_arch = "x86_64", target_os = "linux", target_env = "gnu"))]
+mod trap;
 
 pub use bench::{Bench, Element, bytes, values};
 pub use draw::{Draw, MAX_WORK, Weights};
 pub use memory::{Held, Memory, Plain};
+#[cfg(all(target_arch = "x86_64", target_os = "linux", target_env = "gnu"))]
+pub use trap::carried_out;
 
 pub use crate::ops::REGISTRY;
 
@@ -89,14 +93,32 @@ impl Output {
     }
 }
 
-/// Runs `case` in each of `memories` on every instruction set, and on no other before.
+/// Every instruction set that tests can run here: those of the CPU, and on Linux with glibc `avx2-vnni` where the CPU has
+/// AVX2 without AVX-VNNI. Then a signal handler carries out its instruction, some ten thousand times slower than a CPU.
+pub fn isas() -> impl Iterator<Item = Isa> {
+    let isas = Isa::available();
+    #[cfg(all(target_arch = "x86_64", target_os = "linux", target_env = "gnu"))]
+    let isas = isas.chain(trap::avx2_vnni());
+    isas
+}
+
+/// The names of [`isas`], and which of them is not the CPU's own.
+pub fn isas_in_words() -> String {
+    let name = |isa: Isa| match Isa::parse(isa.name()) {
+        Ok(_) => String::from(isa.name()),
+        Err(_) => format!("{} by a signal handler", isa.name()),
+    };
+    isas().map(name).collect::<Vec<_>>().join(", ")
+}
+
+/// Runs `case` in each of `memories` on each of `isas`, and on no other before.
 ///
 /// # Panics
 /// If one gives other bits than the specification.
-pub fn agree(name: &str, case: &dyn Case, memories: &[Memory]) -> Output {
+pub fn agree(name: &str, case: &dyn Case, isas: &[Isa], memories: &[Memory]) -> Output {
     let want = case.run(Isa::Scalar, Memory::Heap);
     for &memory in memories {
-        for isa in Isa::available() {
+        for &isa in isas {
             if let Some(difference) = case.run(isa, memory).difference(&want) {
                 panic!("{name} on {} in {memory:?}: {difference}", isa.name());
             }

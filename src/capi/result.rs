@@ -5,7 +5,7 @@ use super::session::SessionHandle;
 use super::status::{Failure, Outcome, call, given, own};
 use super::text::Text;
 use super::types::{Camera, Status};
-use crate::runtime::session::{CameraStatus, Occupancy, Session};
+use crate::runtime::session::{CameraStatus, Confidence, Occupancy, Session};
 use std::ffi::c_char;
 use std::mem::MaybeUninit;
 
@@ -49,9 +49,22 @@ fn voxels(session: &Session) -> usize {
     session.model().network().output_grid().iter().product()
 }
 
-/// Voxels of which it is known how sure the network is.
-fn confidences(session: &Session) -> Outcome<usize> {
-    session.keeps_confidence().then(|| voxels(session)).ok_or_else(no_confidence)
+/// [`copy`] of codes of how sure the network is.
+///
+/// # Safety
+/// That of [`copy`].
+unsafe fn copy_codes(
+    session: Option<&SessionHandle>,
+    room: Room<'_, u8>,
+    codes: for<'a> fn(Confidence<'a>) -> &'a [u8],
+    message: (*mut c_char, usize),
+) -> i32 {
+    let length = |session: &Session| session.keeps_confidence().then(|| voxels(session)).ok_or_else(no_confidence);
+    let write = |o: Occupancy<'_>, out: &mut [MaybeUninit<u8>]| {
+        put(out, o.confidence.into_iter().flat_map(codes).copied());
+    };
+    // SAFETY: this function's own condition.
+    unsafe { copy(session, room, length, write, message) }
 }
 
 fn put<T>(out: &mut [MaybeUninit<T>], values: impl Iterator<Item = T>) {
@@ -107,11 +120,8 @@ unsafe extern "C" fn voxcast_session_confidence_occupied(
     message: *mut c_char,
     capacity: usize,
 ) -> i32 {
-    let write = |o: Occupancy<'_>, out: &mut [MaybeUninit<u8>]| {
-        put(out, o.confidence.iter().flat_map(|sure| sure.occupied).copied());
-    };
     // SAFETY: `codes` and `message` are null or have room, as the header asks of the caller.
-    unsafe { copy(session, Room::new(codes, room, length), confidences, write, (message, capacity)) }
+    unsafe { copy_codes(session, Room::new(codes, room, length), |sure| sure.occupied, (message, capacity)) }
 }
 
 /// # Safety
@@ -125,11 +135,8 @@ unsafe extern "C" fn voxcast_session_confidence_class(
     message: *mut c_char,
     capacity: usize,
 ) -> i32 {
-    let write = |o: Occupancy<'_>, out: &mut [MaybeUninit<u8>]| {
-        put(out, o.confidence.iter().flat_map(|sure| sure.class).copied());
-    };
     // SAFETY: `codes` and `message` are null or have room, as the header asks of the caller.
-    unsafe { copy(session, Room::new(codes, room, length), confidences, write, (message, capacity)) }
+    unsafe { copy_codes(session, Room::new(codes, room, length), |sure| sure.class, (message, capacity)) }
 }
 
 /// # Safety

@@ -15,9 +15,7 @@ use super::scale::Scale;
 use super::tensor::{Lifetime, Tensor, TensorId};
 use crate::base::error::{Error, ErrorKind, Result};
 use std::collections::BTreeMap;
-
-/// Channels of tensors that integer products read come in multiples of this.
-const CHANNEL_GROUP: usize = 4;
+use voxcast_kernels::matmul::int8::layout::GROUP;
 
 /// What makes a folded graph one of 8-bit integers.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -108,7 +106,7 @@ impl Graph {
         for operation in &self.operations {
             let odd = product(&operation.op)
                 && !on_image(operation)
-                && !self.tensor(operation.inputs[0]).channels.is_multiple_of(CHANNEL_GROUP);
+                && !self.tensor(operation.inputs[0]).channels.is_multiple_of(GROUP);
             let attention = matches!(operation.op, Op::WindowAttention(_));
             kept.push(attention || odd || names.iter().any(|name| named(operation, name)));
         }

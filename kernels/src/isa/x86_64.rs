@@ -9,7 +9,7 @@ pub struct Avx2 {
     vnni: Option<AvxVnni>,
 }
 
-/// Proof that this CPU has AVX-VNNI: dot products of bytes in 256 bits.
+/// Proof that this CPU has AVX-VNNI: dot products of bytes in 256 bits. In tests a signal handler may carry them out for it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct AvxVnni(());
 
@@ -35,6 +35,15 @@ impl Avx2 {
     /// Dot products of bytes, if the token was made with them.
     pub fn vnni(self) -> Option<AvxVnni> {
         self.vnni
+    }
+
+    /// With AVX-VNNI, whoever executes it.
+    ///
+    /// # Safety
+    /// The process must execute `vpdpbusd` of AVX-VNNI: the CPU does, or a handler of the signal that it gives.
+    #[cfg(all(feature = "cases", target_os = "linux", target_env = "gnu"))]
+    pub(crate) unsafe fn with_vnni(self) -> Self {
+        Self { vnni: Some(AvxVnni(())) }
     }
 
     pub(super) fn name(self) -> &'static str {

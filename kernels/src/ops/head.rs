@@ -17,6 +17,7 @@ use crate::matmul::driver::{Linear, Source};
 use crate::matmul::product::Multiply;
 use crate::matmul::{BLOCK_ROWS, Panels, Product, Residual, SCRATCH};
 use crate::simd::{Kernel, Simd, dispatch};
+use core::convert::identity;
 use core::ops::Range;
 
 /// The head's arguments.
@@ -205,14 +206,7 @@ impl Kernel for Run<'_> {
                 }
             },
             #[inline(always)]
-            |logits, chosen, confidence| {
-                confidence.reference(
-                    args.classes,
-                    chosen,
-                    #[inline(always)]
-                    |voxel, k| logits[voxel * args.classes + k],
-                );
-            },
+            |logits, chosen, confidence| confidence.reference(args.classes, chosen, logits, identity),
         );
     }
 
@@ -231,15 +225,7 @@ impl Kernel for Run<'_> {
                 }
             },
             #[inline(always)]
-            |logits, chosen, confidence| {
-                confidence.run(
-                    s,
-                    args.classes,
-                    chosen,
-                    #[inline(always)]
-                    |voxel, k| logits[voxel * args.classes + k],
-                );
-            },
+            |logits, chosen, confidence| confidence.run(s, args.classes, chosen, logits, identity),
         );
     }
 }

@@ -178,9 +178,7 @@ impl Kernel for Run<'_> {
                     *out = *sum as f32 * scale;
                 }
             },
-            |sums, chosen, confidence| {
-                confidence.reference(classes, chosen, |voxel, k| sums[voxel * classes + k] as f32 * scale);
-            },
+            |sums, chosen, confidence| confidence.reference(classes, chosen, sums, |sum| sum as f32 * scale),
         );
     }
 
@@ -212,8 +210,9 @@ impl Kernel for Run<'_> {
                     s,
                     classes,
                     chosen,
+                    sums,
                     #[inline(always)]
-                    |voxel, k| sums[voxel * classes + k] as f32 * scale,
+                    |sum| sum as f32 * scale,
                 );
             },
         );

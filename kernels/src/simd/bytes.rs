@@ -14,7 +14,7 @@ pub(super) mod avx512;
 pub(super) mod neon;
 
 /// Values of k whose weights lie side by side, column by column.
-pub(crate) const GROUP: usize = 4;
+pub const GROUP: usize = 4;
 /// Bytes of a group of a panel.
 #[cfg(any(target_arch = "x86_64", target_arch = "aarch64"))]
 const STEP: usize = GROUP * super::LANES;

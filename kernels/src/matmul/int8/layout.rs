@@ -10,8 +10,9 @@
 //! Beside the weights two things are stored which follow from them, [`sums`] and [`pairs`]. Kernels rely on both for their
 //! speed and, where they are wrong, give wrong results, so whoever opens a model compares. The same goes for [`fits`].
 
+pub use crate::simd::bytes::GROUP;
+
 use crate::matmul::layout::packed_len;
-use crate::simd::bytes::GROUP;
 use crate::simd::{LANES, Simd};
 
 /// The largest magnitude of an 8-bit element or weight.

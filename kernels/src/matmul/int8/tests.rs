@@ -1,4 +1,5 @@
 use super::*;
+use crate::cases::isas;
 use crate::isa::Isa;
 use crate::matmul::product::Rows;
 use crate::testing::int8::{OwnedI8, PLAIN, WayI8, assert_same, assert_telling, padded, ways};
@@ -111,7 +112,7 @@ fn by_hand() {
     // Rows [1 2 3 4] and [-5 6 -7 8]; columns [1 1 1 1] and [10 -10 10 -10]; a quarter of the sums.
     let mut case = Case::constant(2, 2, &[1, 2, 3, 4], |k, n| [[1, 1, 1, 1], [10, -10, 10, -10]][n][k]);
     case.left[4..].copy_from_slice(&[-5, 6, -7, 8]);
-    for isa in Isa::available() {
+    for isa in isas() {
         // Sums 10, -20, 2, -260: 2.5 and 0.5 go upwards.
         assert_eq!(case.wide::<Raw>(isa), [10, -20, 2, -260]);
         assert_eq!(case.wide::<Wide>(isa), [3, -5, 1, -65]);
@@ -190,7 +191,7 @@ fn the_largest_sums_are_exact() {
             case.owned.signed = signed;
             assert_eq!(case.owned.pairs, [u8::from(calm); 2]);
             let most = if calm { MOST / 254 * 129 } else { MOST } * i32::from(x.signum());
-            for isa in Isa::available() {
+            for isa in isas() {
                 let want: Vec<i32> = (0..7 * 18).map(|i| if i % 18 % 2 == 0 { most } else { -most }).collect();
                 assert_same(&case.wide::<Raw>(isa), &want, &format!("{} {x} {calm}", isa.name()));
             }
@@ -208,7 +209,7 @@ fn sums_wrap_around_alike() {
     case.before = (0..85).map(|i| i as i8).collect();
     let want: Vec<i32> =
         (0..85).map(|i: i32| i32::MAX.wrapping_add(8 * 127 * 127).wrapping_add(i.wrapping_mul(i32::MIN + 1))).collect();
-    for isa in Isa::available() {
+    for isa in isas() {
         assert_same(&case.wide::<Raw>(isa), &want, isa.name());
     }
 }
@@ -219,7 +220,7 @@ fn wrong_notes_are_no_danger() {
     let mut case = Case::constant(13, 35, &[127; 1544], |_, _| 127);
     case.owned.pairs.fill(1);
     case.owned.sums.fill(i32::MIN);
-    for isa in Isa::available() {
+    for isa in isas() {
         assert_eq!(case.all(isa).len(), 13 * 35);
     }
     assert_eq!(case.all(Isa::Scalar), [127; 13 * 35], "the specification reads no notes");

@@ -9,6 +9,8 @@ use core::ops::Range;
 const SHORT: usize = 3 * LANES;
 /// Runs of taps that are each given a pointer even where copied together they would be few elements.
 const FEW_RUNS: usize = 3;
+/// Where a block of the depth holds more runs than this, a run is not long.
+const RUNS_OF_BLOCK: usize = 8;
 
 /// Ways of a first-level cache, at least.
 const WAYS: usize = 8;
@@ -129,7 +131,7 @@ impl<E: Copy + Default> Walk<'_, E> {
     fn copies(&self) -> bool {
         let g = &self.geometry;
         let (len, count) = (g.run_taps() * g.channels, g.kernel.iter().product::<usize>() / g.run_taps());
-        len < SHORT || count > FEW_RUNS && len * 8 < depth::<E>()
+        len < SHORT || count > FEW_RUNS && len * RUNS_OF_BLOCK < depth::<E>()
     }
 
     /// Whether a tile's rows lie so far apart that they fall into one set of the first-level cache, which has fewer ways than

@@ -1,4 +1,5 @@
 use super::*;
+use crate::cases::isas;
 use crate::matmul::int8::scratch_len;
 use crate::ops::conv::tests::{ONE, geometry, naive_sums, natural_index, table};
 use crate::testing::int8::{OwnedI8, PLAIN, WayI8, assert_same, assert_telling, ways};
@@ -92,7 +93,7 @@ fn by_hand() {
     let mut case = Case::new(g, 1, PLAIN, 0);
     case.input = [1, 2, 3, 4, 5, 6].iter().flat_map(|x| [0, *x, 0, 0]).collect();
     case.owned = OwnedI8::new(16, &[2], |k, _| if k % 4 == 1 { [1, 10, 20, -30][k / 4] } else { 99 });
-    for isa in Isa::available() {
+    for isa in isas() {
         // Two more than -30, -40, -50, 60; -110, -49, -48, 123; 40, 54, 65, 6, then a quarter, halves upwards.
         assert_eq!(case.wide(isa), [-7, -9, -12, 16, -27, -12, -11, 31, 11, 14, 17, 2]);
         assert_eq!(case.all(isa), [-7, -9, -12, 16, -27, -12, -11, 31, 11, 14, 17, 2]);
@@ -108,7 +109,7 @@ fn one_channel_by_hand() {
     let mut case = Case::new(geometry([1, 2, 3], 1, [1, 2, 2], ONE, ONE, [0, 1, 1]), 1, PLAIN, 0);
     case.input = vec![1, 2, 3, 4, 5, 6];
     case.owned = OwnedI8::new(4, &[2], |k, _| [1, 10, 20, -30][k]);
-    for isa in Isa::available() {
+    for isa in isas() {
         assert_eq!(case.all(isa), [-7, -9, -12, 16, -27, -12, -11, 31, 11, 14, 17, 2]);
     }
 }

@@ -1,4 +1,5 @@
 use super::*;
+use crate::cases::isas;
 use crate::matmul::int8::scratch_len;
 use crate::testing::int8::{OwnedI8, PLAIN, WayI8, assert_same, assert_telling, ways};
 use crate::testing::{Rng, write_rows};
@@ -108,7 +109,7 @@ fn by_hand() {
     let right = Case::samples([[0, PIXEL, OPEN]; 6]);
     let between = Case::samples([[PIXEL / 2, PIXEL / 4, OPEN]; 6]);
     let closed = Case::samples([[0, 0, i32::MIN]; 6]);
-    for isa in Isa::available() {
+    for isa in isas() {
         assert_eq!(still.all(isa), [4, 8, 16, 32, 64, -127]);
         // -63.5 goes upwards.
         assert_eq!(half.all(isa), [2, 4, 8, 16, 32, -63]);
@@ -134,7 +135,7 @@ fn samples_on_the_border_and_beyond() {
         ([[-128, 0], [384, 512], [256, -128], [0, 640], [-128, -128], [448, 704]], [2, -63, 16, 8, 1, -8]),
     ];
     for (positions, want) in cases {
-        for isa in Isa::available() {
+        for isa in isas() {
             assert_eq!(at(positions).all(isa), want, "{} {positions:?}", isa.name());
         }
     }
@@ -142,13 +143,13 @@ fn samples_on_the_border_and_beyond() {
     let mut case = Case::samples([[i32::MAX, 0, OPEN]; 6]);
     case.offsets[4..8].copy_from_slice(&[i32::MIN, OPEN, 0, i32::MAX]);
     case.offsets[9..11].copy_from_slice(&[i32::MIN, i32::MIN]);
-    for isa in Isa::available() {
+    for isa in isas() {
         assert_eq!(case.all(isa), [0; 6], "{}", isa.name());
     }
     // A step inside: 1/256 of a pixel of 64, and of 127, is a quarter and a half of a step.
     let mut case = at([[256, 511]; 6]);
     case.geometry.padding = [0, 0, 0];
-    for isa in Isa::available() {
+    for isa in isas() {
         // 64 / 256 - 127 * 255 / 256
         assert_eq!(case.all(isa), [-126; 6], "{}", isa.name());
     }
@@ -162,7 +163,7 @@ fn dy_comes_before_dx_and_masks_after_both() {
     case.owned = OwnedI8::new(8, &[0], |k, _| [0, 4, 0, 0, 0, 1, 0, 0][k]);
     case.before.truncate(1);
     case.offsets = vec![PIXEL, 0, 0, PIXEL, OPEN, HALF];
-    for isa in Isa::available() {
+    for isa in isas() {
         // 32 from below; half of 16, a quarter of which counts.
         assert_eq!(case.all(isa), [34]);
     }

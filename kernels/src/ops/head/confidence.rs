@@ -44,9 +44,11 @@ impl Confidence<'_> {
         Confidence { scale: self.scale, occupied: &mut self.occupied[rows.clone()], class: &mut self.class[rows] }
     }
 
-    /// Writes the confidence of voxels whose classes are `chosen`, of `classes`. `logit` gives a voxel's logit of a class.
+    /// Writes the confidence of voxels whose classes are `chosen`. `value` makes logits of `sums`, of which each voxel has one
+    /// for each of `classes`.
     #[inline(always)]
-    pub(crate) fn reference(self, classes: usize, chosen: &[u8], logit: impl Fn(usize, usize) -> f32) {
+    pub(crate) fn reference<T: Copy>(self, classes: usize, chosen: &[u8], sums: &[T], value: impl Fn(T) -> f32) {
+        let logit = |voxel: usize, k: usize| value(sums[voxel * classes + k]);
         for (voxel, &class) in chosen.iter().enumerate() {
             let largest = logit(voxel, usize::from(class));
             let e = |k: usize| exp((logit(voxel, k) - largest) * self.scale);
@@ -60,19 +62,26 @@ impl Confidence<'_> {
 
     /// [`Confidence::reference`] of as many voxels at a time as there are lanes.
     #[inline(always)]
-    pub(crate) fn run<S: Simd>(self, s: S, classes: usize, chosen: &[u8], logit: impl Fn(usize, usize) -> f32) {
+    pub(crate) fn run<S: Simd, T: Copy>(
+        self,
+        s: S,
+        classes: usize,
+        chosen: &[u8],
+        sums: &[T],
+        value: impl Fn(T) -> f32,
+    ) {
         let (one, scale) = (s.splat(ONE), s.splat(self.scale));
         for (chosen, first) in chosen.chunks(LANES).zip((0..).step_by(LANES)) {
             let mut lanes = [0.0; LANES];
             for (i, (lane, &class)) in lanes.iter_mut().zip(chosen).enumerate() {
-                *lane = logit(first + i, usize::from(class));
+                *lane = value(sums[(first + i) * classes + usize::from(class)]);
             }
             let largest = s.load(&lanes);
             // Not a closure: it would not be compiled for the instruction set.
             let (mut occupied, mut empty) = (s.splat(0.0), s.splat(0.0));
             for k in 0..classes {
                 for (i, lane) in lanes[..chosen.len()].iter_mut().enumerate() {
-                    *lane = logit(first + i, k);
+                    *lane = value(sums[(first + i) * classes + k]);
                 }
                 let e = exp_v(s, s.mul(s.sub(s.load(&lanes), largest), scale));
                 if k == 0 {
@@ -97,6 +106,7 @@ pub(crate) mod tests {
     use crate::isa::Isa;
     use crate::simd::{Kernel, dispatch};
     use crate::testing::Rng;
+    use core::convert::identity;
     use proptest::prelude::*;
     use proptest::test_runner::{Config, TestRunner};
 
@@ -113,19 +123,13 @@ pub(crate) mod tests {
         #[inline(always)]
         fn reference(self) {
             let Self { logits, classes, chosen, confidence } = self;
-            confidence.reference(classes, chosen, |voxel, k| logits[voxel * classes + k]);
+            confidence.reference(classes, chosen, logits, identity);
         }
 
         #[inline(always)]
         fn run<S: Simd>(self, s: S) {
             let Self { logits, classes, chosen, confidence } = self;
-            confidence.run(
-                s,
-                classes,
-                chosen,
-                #[inline(always)]
-                |voxel, k| logits[voxel * classes + k],
-            );
+            confidence.run(s, classes, chosen, logits, identity);
         }
     }
 

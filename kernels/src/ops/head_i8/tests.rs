@@ -1,4 +1,5 @@
 use super::*;
+use crate::cases::isas;
 use crate::isa::Isa;
 use crate::ops::head::confidence::tests::sure;
 use crate::testing::Rng;
@@ -111,7 +112,7 @@ fn by_hand() {
     case.layers[2] = OwnedI8::new(4, &[0, 0, 5], pick([[1, 1], [1, -1]]));
     case.input = vec![4, 12, 99, -99, 12, -6, 0, 0];
     case.scale = 0.5;
-    for isa in Isa::available() {
+    for isa in isas() {
         // Voxel 0: 16 and -6, so a = [4, 0], b = [8, 0] and the sums [8, 8, 5]: the first of the largest.
         // Voxel 1: 6 and 20, so a = [1.5, 5] rounded to [2, 5], b = [4, 9] and the sums [13, -5, 5].
         assert_eq!(case.all(isa), (vec![0, 0], vec![4.0, 4.0, 2.5, 6.5, -2.5, 2.5]));
@@ -155,7 +156,7 @@ fn the_largest_sum_wins_where_floats_are_equal() {
     // 2^24 and 2^24 + 1 are the same f32.
     let mut case = Case::new([1, 4, 3], PLAIN, 0);
     case.layers[2] = OwnedI8::new(4, &[0, 1 << 24, (1 << 24) + 1], |_, _| 0);
-    for isa in Isa::available() {
+    for isa in isas() {
         let (classes, logits) = case.all(isa);
         assert_eq!((classes[0], logits[1].to_bits()), (2, logits[2].to_bits()));
     }

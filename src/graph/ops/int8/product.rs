@@ -8,7 +8,7 @@ use crate::graph::element::{Element, Elements};
 use crate::graph::parts::Part;
 use crate::graph::weights::{Span, Values};
 use voxcast_kernels::LANES;
-use voxcast_kernels::matmul::int8::layout::{self, packed_index};
+use voxcast_kernels::matmul::int8::layout::{self, GROUP, packed_index};
 use voxcast_kernels::matmul::int8::scratch_len;
 use voxcast_kernels::matmul::layout::packed_len;
 use voxcast_kernels::matmul::{ProductI8, ResidualI8};
@@ -71,7 +71,8 @@ pub(super) fn values(panels: usize, columns: &[Column], residual: bool) -> Vec<V
     values
 }
 
-/// The columns of `dense` weights, `[outputs, inputs, taps]` in the checkpoint's order, with zeros to a multiple of 4.
+/// The columns of `dense` weights, `[outputs, inputs, taps]` in the checkpoint's order, with zeros to a multiple
+/// of [`GROUP`].
 pub(super) fn columns(
     weight: &[f64],
     bias: &[f64],
@@ -80,7 +81,7 @@ pub(super) fn columns(
 ) -> Result<Vec<Column>> {
     let depth = weight.len() / bias.len();
     let taps = depth / inputs;
-    let mut ordered = vec![0.0; depth.next_multiple_of(4)];
+    let mut ordered = vec![0.0; depth.next_multiple_of(GROUP)];
     let columns = weight.chunks_exact(depth).zip(bias).enumerate().map(|(n, (weight, &bias))| {
         for (i, &w) in weight.iter().enumerate() {
             ordered[i % taps * inputs + i / taps] = w;
