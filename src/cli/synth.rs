@@ -1,6 +1,7 @@
 //! `voxcast synth`
 
 use super::import::read_network;
+use super::terminal::tell;
 use super::{ThreadCount, frame, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
@@ -66,14 +67,14 @@ impl Synth {
         let grid = Grid::of(synthesiser.network());
         let Some(frames) = self.frames.map(|n| n as usize) else {
             synthesiser.frame(self.seed).save_scene(output, grid)?;
-            println!("scene of seed {} in {}", self.seed, output.display());
+            tell!("scene of seed {} in {}", self.seed, output.display())?;
             return Ok(());
         };
         work("frames", frames as u64, workers, |index| {
             let frame = synthesiser.frame_of(self.seed, index as usize, frames);
             frame.save_scene(&output.join(format!("{index:03}")), grid)
         })?;
-        println!("{frames} scenes of seed {} in {}", self.seed, output.display());
+        tell!("{frames} scenes of seed {} in {}", self.seed, output.display())?;
         Ok(())
     }
 
@@ -90,7 +91,7 @@ impl Synth {
             // Files appear whole or not at all.
             if path.exists() { Ok(()) } else { synthesiser.frame(seed).save_tensors(&path, grid, self.pixels) }
         })?;
-        println!("{} frames in {}", self.count, directory.display());
+        tell!("{} frames in {}", self.count, directory.display())?;
         Ok(())
     }
 }
