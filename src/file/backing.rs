@@ -101,6 +101,7 @@ fn open(path: &Path, what: &str) -> Result<(File, u64)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs;
 
     #[test]
     fn bytes_of_any_alignment_start_at_an_element() {
