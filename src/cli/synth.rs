@@ -7,6 +7,7 @@ use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
+use voxcast::container::Container;
 use voxcast::network::Grid;
 use voxcast::synth::{Synthesiser, set_file};
 use voxcast::{Error, Result};
@@ -64,6 +65,7 @@ impl Synth {
             return self.write_set(&synthesiser, directory, workers);
         }
         let output = self.output.as_deref().unwrap_or(Path::new("."));
+        frame::create_directory(output)?;
         let grid = Grid::of(synthesiser.network());
         let Some(frames) = self.frames.map(|n| n as usize) else {
             synthesiser.frame(self.seed).save_scene(output, grid)?;
@@ -79,6 +81,7 @@ impl Synth {
     }
 
     fn write_set(&self, synthesiser: &Synthesiser, directory: &Path, workers: usize) -> Result<()> {
+        frame::create_directory(directory)?;
         synthesiser.begin_set(directory)?;
         let grid = Grid::of(synthesiser.network());
         let last = self.seed.checked_add(self.count).filter(|&end| end <= 1_000_000_000);
@@ -89,10 +92,22 @@ impl Synth {
             let seed = self.seed + index;
             let path = directory.join(set_file(seed));
             // Files appear whole or not at all.
-            if path.exists() { Ok(()) } else { synthesiser.frame(seed).save_tensors(&path, grid, self.pixels) }
+            match path.exists() {
+                true if self.pixels => has_pixels(&path),
+                true => Ok(()),
+                false => synthesiser.frame(seed).save_tensors(&path, grid, self.pixels),
+            }
         })?;
         tell!("{} frames in {}", self.count, directory.display())?;
         Ok(())
+    }
+}
+
+/// Refuses a frame that was drawn before and lacks what is asked for now.
+fn has_pixels(path: &Path) -> Result<()> {
+    match Container::open(path)?.tensor("pixel.class") {
+        Some(_) => Ok(()),
+        None => Err(Error::mismatch("it was drawn without --pixels, expected tensor \"pixel.class\"").in_file(path)),
     }
 }
 

@@ -91,6 +91,15 @@ fn files_that_are_not_there() {
         assert!(line.contains(expected), "{line}");
     }
     fs::rename(place.path("drawn/a"), place.path("scene")).unwrap();
+    for arguments in [
+        &["synth", "-o", &model][..],
+        &["synth", "--frames", "2", "-o", &model],
+        &["synth", "--count", "1", "--set", &model],
+        &["demo", "-o", &model],
+        &["run", "--model", &model, &scene, "-o", &out, "--dump", &model],
+    ] {
+        assert!(refused(&model, arguments).contains("a file is there, expected a directory"), "{arguments:?}");
+    }
     // What is no scene, and may be taken for one.
     let calibration = place.text("scene/calibration.json");
     let line = refused(&calibration, &["run", "--model", &model, &calibration, "-o", &out]);
