@@ -1,6 +1,5 @@
 //! The command line. `voxcast --help` is its manual.
 
-#![allow(clippy::print_stdout, clippy::print_stderr, reason = "a program talks to its user")]
 #![allow(unreachable_pub, reason = "a program has no public items")]
 
 mod cli;
@@ -13,7 +12,7 @@ fn main() -> ExitCode {
     match arguments.run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("voxcast: {error}");
+            cli::complain(&error);
             ExitCode::from(1)
         }
     }

@@ -48,16 +48,28 @@ impl Evaluation {
             let message = format!("models: found {}, expected one, or two to compare", models.len());
             return Err(PyValueError::new_err(message).into());
         }
+        check_limit(limit)?;
         let named: Named = data.parse().map_err(|e| PyValueError::new_err(format!("data {data:?}: {e}")))?;
         let shard = shard.map_or(Ok(Shard::WHOLE), str::parse)?;
         let scope = Scope { losses, calibration, limit, shard, ..Scope::default() };
         let predictors = models.iter().map(|model| Predictor::model(model.get().model.clone())).collect();
-        py.detach(|| {
+        let mut raised = None;
+        let made = py.detach(|| -> voxcast::Result<Self> {
             let evaluation = eval::Evaluation::new(named.open()?, data, predictors, &scope)?;
             let mut totals = evaluation.totals();
-            let journal = resume.map(|path| evaluation.resume(&path, &mut totals)).transpose()?;
+            let mut watch = |_| {
+                Python::attach(|py| py.check_signals()).map_err(|error| {
+                    raised = Some(error);
+                    Error::new(ErrorKind::Unsupported, "the journal was not read to its end")
+                })
+            };
+            let journal = resume.map(|path| evaluation.resume(&path, &mut totals, &mut watch)).transpose()?;
             Ok(Self { evaluation: Arc::new(evaluation), state: Mutex::new(State { totals, journal }) })
-        })
+        });
+        match raised {
+            Some(error) => Err(Failure::Python(error)),
+            None => Ok(made?),
+        }
     }
 
     /// The frames that have no score yet, in the order of the set.
@@ -226,6 +238,14 @@ impl Report {
     }
 }
 
+/// Refuses to score no frame at all.
+fn check_limit(limit: Option<usize>) -> Outcome {
+    match limit {
+        Some(0) => Err(PyValueError::new_err("limit: found 0, expected at least 1").into()),
+        _ => Ok(()),
+    }
+}
+
 /// Fits the temperature of a model's probabilities to a set with labels, which training has not seen, and writes the model with
 /// it to `output`, which may be its own file. Classes and logits stay as they are. Returns the model that was written.
 ///
@@ -241,6 +261,7 @@ pub(crate) fn calibrate_confidence(
     threads: Option<usize>,
     isa: Option<&str>,
 ) -> Outcome<Model> {
+    check_limit(limit)?;
     let named: Named = data.parse().map_err(|e| PyValueError::new_err(format!("data {data:?}: {e}")))?;
     let (threads, isa) = (machine::threads(threads)?, machine::isa(isa)?);
     let options = SessionOptions { isa, threads, ..SessionOptions::default() };
@@ -269,5 +290,6 @@ pub(crate) fn calibrate_confidence(
 #[pyfunction]
 #[pyo3(signature = (journals, *, limit = None))]
 pub(crate) fn merge(py: Python<'_>, journals: Vec<PathBuf>, limit: Option<usize>) -> Outcome<Report> {
+    check_limit(limit)?;
     Ok(Report { summary: py.detach(|| Summary::merge(&journals, limit))? })
 }

@@ -3,7 +3,7 @@
 use crate::error::{Failure, Outcome, warn};
 use crate::machine;
 use numpy::{PyReadonlyArrayDyn, PyUntypedArrayMethods};
-use pyo3::exceptions::PyTypeError;
+use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 use std::collections::HashMap;
@@ -241,7 +241,7 @@ struct Plan {
 }
 
 fn one_of(what: &str, found: &str, expected: &str) -> Failure {
-    Failure::Python(PyTypeError::new_err(format!("{what}: found {found:?}, expected {expected}")))
+    Failure::Python(PyValueError::new_err(format!("{what}: found {found:?}, expected {expected}")))
 }
 
 impl Wish {

@@ -18,7 +18,8 @@ use voxcast::{Budget, SessionOptions, Step};
 /// Session(model, rig, *, threads=None, logits=False, confidence=False, isa=None)
 ///
 /// threads: as many as there are CPUs by default. logits: whether results have them. confidence: whether results say how
-/// sure the network is. isa: "scalar", "avx2" or "avx512"; the fastest of this CPU by default. None of these changes a bit of a result.
+/// sure the network is. isa: "scalar", "avx2" and others, as on the command line; the fastest of this CPU by default. None of
+/// these changes a bit of a result.
 ///
 /// The interpreter's lock is free while a frame runs: sessions in several Python threads run side by side. One session
 /// serves one thread at a time, and raises BusyError in another.

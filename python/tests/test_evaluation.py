@@ -99,6 +99,8 @@ def test_what_cannot_be_evaluated_is_refused(model, heldout, place):
         (lambda: voxcast.evaluate(model, "synthetic:nowhere"), voxcast.FileError, "nowhere"),
         (lambda: voxcast.evaluate(model, heldout, shard="3/3"), voxcast.FormatError, "shard 3/3"),
         (lambda: voxcast.evaluate(model, heldout, workers=0), ValueError, "workers: found 0"),
+        (lambda: voxcast.evaluate(model, heldout, limit=0), ValueError, "limit: found 0"),
+        (lambda: voxcast.merge([place / "none"], limit=0), ValueError, "limit: found 0"),
         (lambda: voxcast.evaluate(model, heldout, resume=place / "model.safetensors"), voxcast.FormatError, "line 1"),
     ]:
         with pytest.raises(kind, match=text):

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import pickle
+import re
 import sys
 from pathlib import Path
 
@@ -62,8 +63,20 @@ def test_errors_are_the_lines_of_the_command_line(place, model):
     assert (str(again), again.path) == (str(raised.value), raised.value.path)
     with pytest.raises(voxcast.FileError, match="calibration.json"):
         voxcast.Scene.open(place)
-    with pytest.raises(voxcast.UnsupportedError, match="isa"):
+    with pytest.raises(voxcast.UnsupportedError, match="isa") as raised:
         model.selftest(isa="mmx")
+    # Types name the instruction sets that there are.
+    types = (Path(voxcast.__file__).parent / "_native.pyi").read_text()
+    named = re.search(r"_Isa = Literal\[(.*)\]", types).group(1).replace('"', "")
+    assert str(raised.value).endswith(f"expected one of {named}")
+    for wrong, kind, text in [
+        (lambda: voxcast.Model.shipped("f64"), ValueError, 'precision: found "f64"'),
+        (lambda: voxcast.import_checkpoint({}, "edge", precision="f64"), ValueError, 'precision: found "f64"'),
+        (lambda: voxcast.import_checkpoint({}, "edge", fold="some"), ValueError, 'fold: found "some"'),
+        (lambda: voxcast.import_checkpoint(3, "edge"), TypeError, "checkpoint: found int"),
+    ]:
+        with pytest.raises(kind, match=text):
+            wrong()
     with pytest.raises(voxcast.MismatchError, match="threads: found 0"):
         model.selftest(threads=0)
 

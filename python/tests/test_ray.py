@@ -1,7 +1,9 @@
 """A Ray cluster of two nodes on this machine, one of which is killed in the middle."""
 
 import logging
+from dataclasses import replace
 
+import numpy
 import pytest
 import ray
 from ray.cluster_utils import Cluster
@@ -61,23 +63,32 @@ def test_scenes_are_run_and_a_node_that_computes_wrongly_is_found_out(cluster, m
         scene = voxcast.Scene.street(model, seed)
         scene.save(path)
         rig = voxcast.Rig.build(model, scene)
-        expected[str(path)] = voxcast.Session(model, rig, threads=1).run(scene).digest
+        expected[str(path)] = voxcast.Session(model, rig, threads=1, logits=True, confidence=True).run(scene)
     results = {result.scene: result for result in voxcast.ray.run(model, paths, check=1)}
-    assert {scene: result.digest for scene, result in results.items()} == expected
+    assert {scene: result.digest for scene, result in results.items()} == {s: r.digest for s, r in expected.items()}
     assert all(result.classes.shape == tuple(model.grid) for result in results.values())
-    assert all(result.logits is None for result in results.values())
+    for result in results.values():
+        assert result.logits is None and result.confidence_occupied is None and result.confidence_class is None
+
+    # What else may be asked for is that of a session, and compared between nodes as well.
+    more = list(voxcast.ray.run(model, paths, logits=True, confidence=True, check=3))
+    assert {result.scene for result in more} == set(expected)
+    for result in more:
+        for name in ("classes", "logits", "confidence_occupied", "confidence_class"):
+            assert numpy.array_equal(getattr(result, name), getattr(expected[result.scene], name)), name
 
     class Faulty(voxcast.ray._Runner):
-        """On the second node, the classes come out otherwise."""
+        """On the second node, what was asked for last comes out otherwise."""
 
         def compute(self, path: str):
             frame = super().compute(path)
             here = ray.get_runtime_context().get_node_id()
-            return type(frame)(frame.classes, frame.support, frame.logits, (frame.digests[0] + here, None))
+            return replace(frame, digests=(*frame.digests[:-1], frame.digests[-1] + here))
 
     monkeypatch.setattr(voxcast.ray, "_Runner", Faulty)
-    with pytest.raises(voxcast.MismatchError, match="ray-scene-0: nodes [0-9a-f]+ and [0-9a-f]+ disagree"):
-        list(voxcast.ray.run(model, paths, check=3))
+    for asked in ({}, {"confidence": True}):
+        with pytest.raises(voxcast.MismatchError, match="ray-scene-0: nodes [0-9a-f]+ and [0-9a-f]+ disagree"):
+            list(voxcast.ray.run(model, paths, check=3, **asked))
 
 
 def test_errors_of_a_frame_are_the_callers(cluster, model, place):

@@ -27,10 +27,10 @@ def evaluate(
     """Scores a model on a data set with labels; two models are scored on the same frames and compared.
 
     data: as on the command line: "synthetic:DIR", "surroundocc:ROOT:LABELS[:SCENES]", "occ3d:ROOT:LABELS[:SCENES]",
-        "semantickitti:ROOT[:SPLIT[:stereo]]", "uniocc:ROOT[:IMAGES]" and others (docs/evaluation.md).
+        "semantickitti:ROOT[:SPLIT[:stereo][:all]]", "uniocc:ROOT[:IMAGES]" and others (docs/evaluation.md).
     losses: also the four losses of the training.
     calibration: also how often what the network says is so likely comes true. limit: only the first frames. shard: "I/N", see docs/many-machines.md.
-    resume: a journal of every frame's score, from which the same call goes on.
+    resume: a journal of every frame's score, from which the same call goes on, if the labels are the same.
     workers: frames at a time, with `threads` in all; by default as many as `voxcast eval` takes. None of it changes a number.
     progress: called with the frames done and all that were left; by default a line on a terminal.
 

@@ -42,6 +42,9 @@ def import_checkpoint(
     wish = (text, target, precision, fold, exact, self_test, threads)
     if isinstance(checkpoint, (str, os.PathLike)):
         return _native.import_file(os.fspath(checkpoint), wish)
+    if not isinstance(checkpoint, Mapping) and not hasattr(checkpoint, "state_dict"):
+        found = type(checkpoint).__name__
+        raise TypeError(f"checkpoint: found {found}, expected a file, a module, or a mapping of names to arrays")
     state = checkpoint if isinstance(checkpoint, Mapping) else checkpoint.state_dict()
     return _native.import_tensors(_tensors(state), wish)
 

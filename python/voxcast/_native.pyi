@@ -32,7 +32,7 @@ __all__ = [
 __version__: str
 
 _Path = str | PathLike[str]
-_Isa = Literal["scalar", "avx2", "avx512"]
+_Isa = Literal["scalar", "avx2", "avx2-vnni", "avx512", "avx512-vnni", "neon", "neon-dot", "neon-i8mm"]
 _Order = Literal["bgr", "rgb"]
 _Wish = tuple[str, str | None, str, str, bool, bool, int | None]
 _Images = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]

@@ -19,6 +19,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from hashlib import blake2b
 from typing import Any, Generic, TypeVar
 
 import numpy
@@ -55,6 +56,10 @@ class Result:
     """[X, Y, Z], by how many feature pixels each voxel is seen."""
     logits: NDArray[numpy.float32] | None
     """[X, Y, Z, classes], if they were asked for."""
+    confidence_occupied: NDArray[numpy.uint8] | None
+    """[X, Y, Z], the probability that the voxel is occupied, 0 to 255 for 0 to 1, if it was asked for."""
+    confidence_class: NDArray[numpy.uint8] | None
+    """[X, Y, Z], that of its class, likewise."""
     digest: str
     """XXH3-64 of the classes."""
     node: str
@@ -106,6 +111,7 @@ def run(
     scenes: Sequence[str | os.PathLike[str]],
     *,
     logits: bool = False,
+    confidence: bool = False,
     actors: int | None = None,
     threads: int = 1,
     check: int = 8,
@@ -114,15 +120,19 @@ def run(
 ) -> Iterator[Result]:
     """Runs a model on scenes, on all nodes of the cluster. Results come as they are ready, not in the order of the scenes.
 
-    scenes: directories or .safetensors files, as `Scene.open` takes them. The other arguments are those of `evaluate`.
+    scenes: directories or .safetensors files, as `Scene.open` takes them.
+    logits, confidence: what else results have, as of a `Session`. The other arguments are those of `evaluate`.
     """
     paths = [os.fspath(scene) for scene in scenes]
     told = progress or terminal_progress("running")
-    with _Crew[str, _Frame](_Runner, (model, logits, threads), actors, threads, patience) as crew:
+    with _Crew[str, _Frame](_Runner, (model, logits, confidence, threads), actors, threads, patience) as crew:
         places = _spread(len(paths), check)
         for done, (path, frame, node) in enumerate(crew.compute(paths, places, lambda frame: frame.digests), 1):
             told(done, len(paths))
-            yield Result(path, frame.classes, frame.support, frame.logits, frame.digests[0], node)
+            occupied, of_class = frame.confidence or (None, None)
+            yield Result(
+                path, frame.classes, frame.support, frame.logits, occupied, of_class, frame.digests[0], node
+            )
 
 
 def _spread(count: int, wanted: int) -> set[int]:
@@ -155,14 +165,17 @@ class _Frame:
     classes: NDArray[numpy.uint8]
     support: NDArray[numpy.uint16]
     logits: NDArray[numpy.float32] | None
-    digests: tuple[str, str | None]
+    confidence: tuple[NDArray[numpy.uint8], NDArray[numpy.uint8]] | None
+    digests: tuple[str, ...]
+    """Of all that was asked for: what two nodes must agree on."""
 
 
 class _Runner:
     """The actor that runs scenes. The matrices are built anew where the cameras have moved."""
 
-    def __init__(self, model: Model, logits: bool, threads: int) -> None:
-        self.model, self.logits, self.threads = model, logits, threads
+    def __init__(self, model: Model, logits: bool, confidence: bool, threads: int) -> None:
+        self.model, self.threads = model, threads
+        self.logits, self.confidence = logits, confidence
         self.calibration = numpy.empty((0, 4, 4), numpy.float32)
         self.session: Session | None = None
 
@@ -175,13 +188,20 @@ class _Runner:
         if self.session is None or not numpy.array_equal(calibration, self.calibration):
             rig = Rig.build(self.model, scene, threads=self.threads)
             if self.session is None or self.session.cameras != rig.cameras:
-                self.session = Session(self.model, rig, threads=self.threads, logits=self.logits)
+                self.session = Session(
+                    self.model, rig, threads=self.threads, logits=self.logits, confidence=self.confidence
+                )
             else:
                 self.session.set_rig(rig)
             self.calibration = calibration
         result = self.session.run(scene)
-        digests = (result.digest, result.logits_digest)
-        return _Frame(result.classes, result.support, result.logits, digests)
+        digests, confidence = [result.digest], None
+        if result.logits_digest is not None:
+            digests.append(result.logits_digest)
+        if result.confidence_occupied is not None and result.confidence_class is not None:
+            confidence = (result.confidence_occupied, result.confidence_class)
+            digests += [blake2b(codes, digest_size=8).hexdigest() for codes in confidence]
+        return _Frame(result.classes, result.support, result.logits, confidence, tuple(digests))
 
 
 Value = TypeVar("Value")

@@ -22,6 +22,25 @@ pub fn floats(values: &[f32]) -> u64 {
     hash.digest()
 }
 
+/// XXH3-64 (seed 0) of bytes that come in parts.
+#[cfg(feature = "eval")]
+pub(crate) struct Digest(Xxh3);
+
+#[cfg(feature = "eval")]
+impl Digest {
+    pub(crate) fn new() -> Self {
+        Self(Xxh3::new())
+    }
+
+    pub(crate) fn add(&mut self, bytes: &[u8]) {
+        self.0.update(bytes);
+    }
+
+    pub(crate) fn finish(&self) -> u64 {
+        self.0.digest()
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -50,6 +50,14 @@ impl Pose {
         self.shift.into()
     }
 
+    /// Its numbers: the rotation column by column, then the shift.
+    #[cfg(feature = "eval")]
+    pub(crate) fn numbers(&self) -> [f64; 12] {
+        let [a, b, c, d, e, f, g, h, i] = self.rotation.to_cols_array();
+        let [x, y, z] = self.shift.to_array();
+        [a, b, c, d, e, f, g, h, i, x, y, z]
+    }
+
     /// The outer frame in the inner one.
     #[must_use]
     pub fn inverse(&self) -> Self {

@@ -1,5 +1,6 @@
 //! `voxcast calibrate`, and what `import --calibrate` shares with it.
 
+use super::terminal::tell;
 use super::{Machine, frame, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
@@ -43,13 +44,13 @@ pub const FRAMES: u32 = 32;
 
 impl Calibrate {
     pub fn run(self) -> Result<()> {
-        frame::check_output(&self.output)?;
+        frame::check_outputs([("MODEL", &self.model)], [("--output", &self.output)])?;
         let model = Arc::new(Model::open(&self.model)?);
         let in_model = |e: Error| e.in_file(&self.model);
         let means = (self.machine.isa()?, self.machine.threads()?);
         let ranges = measure(&model, &self.scenes, self.frames, means).map_err(in_model)?;
         ranges.save(&self.output)?;
-        println!("{}: {} tensors, measured on {} frames", self.output.display(), ranges.tensors.len(), ranges.frames);
+        tell!("{}: {} tensors, measured on {} frames", self.output.display(), ranges.tensors.len(), ranges.frames)?;
         Ok(())
     }
 }
@@ -133,9 +134,9 @@ impl Scenes {
         match self.find(index) {
             (Source::Scene(path), _) => frame::read(path, network),
             (Source::Set(_, set), frame) => {
-                let scene = set.frame(frame)?.scene;
+                let (scene, notes) = set.scene(frame)?;
                 scene.check(network).map_err(|e| e.in_file(&self.path(index)))?;
-                Ok((scene, vec![]))
+                Ok((scene, notes))
             }
         }
     }

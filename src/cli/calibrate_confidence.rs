@@ -1,5 +1,6 @@
 //! `voxcast calibrate-confidence`
 
+use super::terminal::tell;
 use super::{Machine, frame, terminal};
 use clap::Args;
 use std::path::PathBuf;
@@ -57,13 +58,13 @@ impl CalibrateConfidence {
         bar.finish_and_clear();
         model.save_with_temperature(fit.temperature, &self.output)?;
         let (was, voxels) = (model.temperature(), fit.voxels);
-        println!(
+        tell!(
             "{}: temperature {} (before {was}), of {voxels} voxels in {} frames, each run {} times",
             self.output.display(),
             fit.temperature,
             fit.frames,
             fit.passes
-        );
+        )?;
         Ok(())
     }
 }

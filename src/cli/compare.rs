@@ -1,6 +1,7 @@
 //! `voxcast compare`
 
 use super::dump::Dump as Collector;
+use super::terminal::tell;
 use super::{Machine, frame, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
@@ -76,14 +77,14 @@ impl Compare {
             (Some(_), _) => return usage("one scene beside --model"),
         };
         if self.json {
-            println!("{}", json(&stages));
+            tell!("{}", json(&stages))?;
         } else {
-            print(&stages);
+            print(&stages)?;
         }
         let Some(first) = stages.iter().find(|s| s.diverges()) else {
             if !self.json {
                 let note = if common { " that both have" } else { "" };
-                println!("all {} stages{note} agree", stages.len());
+                tell!("all {} stages{note} agree", stages.len())?;
             }
             return Ok(());
         };
@@ -173,12 +174,18 @@ fn describe(stage: &Stage) -> String {
     }
 }
 
-fn print(stages: &[Stage]) {
+fn print(stages: &[Stage]) -> Result<()> {
     let first = stages.iter().position(Stage::diverges);
-    println!(
+    tell!(
         "{:28} {:>10} {:>10} {:>9} {:>9} {:>7} {:>10}  at: values",
-        "stage", "elements", "differing", "max", "over rms", "snr dB", "ulp"
-    );
+        "stage",
+        "elements",
+        "differing",
+        "max",
+        "over rms",
+        "snr dB",
+        "ulp"
+    )?;
     for (index, stage) in stages.iter().enumerate() {
         let mark = if first == Some(index) { "  <- first" } else { "" };
         match &stage.outcome {
@@ -186,14 +193,20 @@ fn print(stages: &[Stage]) {
                 let ulp = d.ulp.map_or_else(|| "-".to_owned(), |ulp| ulp.to_string());
                 let snr = d.snr.map_or_else(|| "-".to_owned(), |snr| format!("{snr:.1}"));
                 let [x, y] = d.values;
-                println!(
+                tell!(
                     "{:28} {:>10} {:>10} {:>9.2e} {:>9.2e} {snr:>7} {ulp:>10}  {:?}: {x} {y}{mark}",
-                    stage.name, stage.elements, d.count, d.max, d.relative, d.at
-                );
+                    stage.name,
+                    stage.elements,
+                    d.count,
+                    d.max,
+                    d.relative,
+                    d.at
+                )?;
             }
-            _ => println!("{:28} {:>10} {:>10}{mark}", stage.name, stage.elements, describe(stage)),
+            _ => tell!("{:28} {:>10} {:>10}{mark}", stage.name, stage.elements, describe(stage))?,
         }
     }
+    Ok(())
 }
 
 fn json(stages: &[Stage]) -> serde_json::Value {

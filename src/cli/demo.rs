@@ -1,6 +1,7 @@
 //! `voxcast demo`
 
 use super::frame::{self, RigFile};
+use super::terminal::tell;
 use super::{Machine, run, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
@@ -17,7 +18,7 @@ use voxcast::picture::{self, Figure, Palette};
 use voxcast::session::{Occupancy, views};
 use voxcast::synth::{CLASSES, Frame, Synthesiser};
 use voxcast::weights::Precision;
-use voxcast::{Error, Model, Network, Result, Session, SessionOptions};
+use voxcast::{Model, Network, Result, Session, SessionOptions};
 
 /// The trained network that ships with the program (`docs/model-card.md`).
 static EDGE: &[u8] = include_bytes!("../../assets/edge.safetensors");
@@ -58,7 +59,7 @@ pub struct Demo {
 impl Demo {
     pub fn run(self) -> Result<()> {
         let directory = &self.output;
-        std::fs::create_dir_all(directory).map_err(|e| Error::io(directory, "create", &e))?;
+        frame::create_directory(directory)?;
         let options = frame::options(&self.machine)?;
 
         let model_path = directory.join("model.safetensors");
@@ -68,16 +69,16 @@ impl Demo {
         let start = Instant::now();
         let drawn = Synthesiser::new(network)?.frame(self.seed);
         drawn.save_scene(&directory.join("scene"), Grid::of(network))?;
-        println!("street of seed {} drawn in {}", self.seed, terminal::time(start.elapsed()));
+        tell!("street of seed {} drawn in {}", self.seed, terminal::time(start.elapsed()))?;
 
         let start = Instant::now();
         let (rig, _) = frame::rig(RigFile::default(), &model, &drawn.scene, &options)?;
         let rig = Arc::new(rig);
-        println!("six matrices built in {}", terminal::time(start.elapsed()));
+        tell!("six matrices built in {}", terminal::time(start.elapsed()))?;
         rig.save(&directory.join("rig.safetensors"), network)?;
 
         let mut session = Session::new(model.clone(), rig, &options)?;
-        println!("session of {} planned", terminal::bytes(session.taken().total()));
+        tell!("session of {} planned", terminal::bytes(session.taken().total()))?;
         // The first frame waits for the model's pages.
         session.run(&views(&drawn.scene))?;
         let (mut cameras, mut fusion) = (Duration::ZERO, Duration::ZERO);
@@ -85,7 +86,7 @@ impl Demo {
         let result = session.run_observed(&views(&drawn.scene), &mut |event| {
             *(if event.camera.is_some() { &mut cameras } else { &mut fusion }) += event.elapsed;
         })?;
-        println!(
+        tell!(
             "frame of {} cameras in {} on {} threads with {} (backbone and pyramid {}, after the gather {}), digest {}",
             drawn.scene.cameras(),
             terminal::time(start.elapsed()),
@@ -94,18 +95,18 @@ impl Demo {
             terminal::time(cameras),
             terminal::time(fusion),
             run::digest(&result)
-        );
+        )?;
         let score = score(&drawn, &result);
-        println!("{score}");
+        tell!("{score}")?;
         run::write(&directory.join("occupancy.npz"), network, &result, false)?;
         draw(&directory.join("occupancy.png"), network, &drawn, &result, &score)?;
         let titles = ["voxcast demo", "a street that the network was not trained on"];
         let page = directory.join("demo.html");
         run::write_page(&page, network, &result, Some(&drawn.scene), Some(&drawn.labels), titles)?;
         let d = directory.display();
-        println!(
+        tell!(
             "see {d}/occupancy.png and {d}/demo.html; the same again: voxcast run --model {d}/model.safetensors {d}/scene -o out.npz"
-        );
+        )?;
         Ok(())
     }
 }

@@ -1,5 +1,6 @@
 //! `--dump`: stages under the names and in the layout of the golden cases (channels first, as PyTorch has them).
 
+use super::frame;
 use safetensors::Dtype;
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -120,7 +121,7 @@ impl Dump {
             let stage = Stage { dtype: Dtype::U8, shape: grid.size.to_vec(), bytes: classes.to_vec() };
             self.stages.insert("classes".to_owned(), stage);
         }
-        std::fs::create_dir_all(directory).map_err(|e| Error::io(directory, "create", &e))?;
+        frame::create_directory(directory)?;
         let tensors = self.stages.iter().map(|(name, stage)| container::Tensor {
             name: name.clone(),
             dtype: stage.dtype,

@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use voxcast::dataset::{DataSet, FORMS, Named};
 use voxcast::eval::{
-    ABOUT, Evaluation, Means, Predictor, Says, Scope, Shard, Summary, majority, write_submission, write_text,
+    ABOUT, Evaluation, Journal, Means, Predictor, Says, Scope, Shard, Summary, Totals, majority, write_submission,
+    write_text,
 };
 use voxcast::{Error, Model, Result};
 
@@ -108,13 +109,31 @@ fn about(text: &str) -> std::result::Result<(String, String), String> {
     }
 }
 
+/// Opens the journal, and shows how far its frames are counted.
+fn resume(evaluation: &Evaluation, path: &Path, totals: &mut Totals) -> Result<Journal> {
+    let bar = terminal::progress("comparing labels with the journal's", evaluation.left(totals).len());
+    let journal = evaluation.resume(path, totals, &mut |counted| {
+        bar.set_position(counted as u64);
+        Ok(())
+    })?;
+    bar.finish_and_clear();
+    Ok(journal)
+}
+
 impl Eval {
     pub fn run(self) -> Result<()> {
-        let outputs = [&self.json, &self.markdown, &self.confusion, &self.reliability, &self.resume, &self.submission];
-        for path in outputs.into_iter().flatten() {
-            frame::check_output(path)?;
-        }
-        self.check_apart()?;
+        let outputs = [
+            ("--resume", &self.resume),
+            ("--json", &self.json),
+            ("--markdown", &self.markdown),
+            ("--confusion", &self.confusion),
+            ("--reliability", &self.reliability),
+            ("--submission", &self.submission),
+        ];
+        let inputs = self.model.iter().map(|path| ("--model", path));
+        let inputs = inputs.chain(self.compare.iter().map(|path| ("--compare", path)));
+        let inputs = inputs.chain(self.merge.iter().map(|path| ("--merge", path)));
+        frame::check_outputs(inputs, outputs.iter().filter_map(|(name, path)| Some((*name, path.as_ref()?))))?;
         let limit = self.limit.map(|limit| limit as usize);
         match (&self.data, &self.submission) {
             (Some(data), Some(submission)) => self.submit(submission, data, limit),
@@ -150,7 +169,7 @@ impl Eval {
         let scope = Scope { losses: self.losses, calibration, limit, shard, ..Scope::default() };
         let evaluation = Arc::new(Evaluation::new(set, &data.to_string(), predictors, &scope)?);
         let mut totals = evaluation.totals();
-        let mut journal = self.resume.as_deref().map(|path| evaluation.resume(path, &mut totals)).transpose()?;
+        let mut journal = self.resume.as_deref().map(|path| resume(&evaluation, path, &mut totals)).transpose()?;
         let means = Means {
             workers: usize::from(self.workers),
             threads: self.machine.threads.count(),
@@ -164,29 +183,6 @@ impl Eval {
         })?;
         bar.finish_and_clear();
         Ok(evaluation.summary(totals))
-    }
-
-    /// Refuses an output in the place of another or of a journal, of which the last would be left: a report in the place of
-    /// hours of scores.
-    fn check_apart(&self) -> Result<()> {
-        let mut taken: Vec<(&str, PathBuf)> = Vec::new();
-        let merged = self.merge.iter().map(|path| ("--merge", path));
-        let outputs = [
-            ("--resume", &self.resume),
-            ("--json", &self.json),
-            ("--markdown", &self.markdown),
-            ("--confusion", &self.confusion),
-            ("--reliability", &self.reliability),
-        ];
-        for (flag, path) in merged.chain(outputs.iter().filter_map(|(flag, path)| Some((*flag, path.as_ref()?)))) {
-            let place = std::path::absolute(path).map_err(|e| Error::io(path, "find", &e))?;
-            let place = std::fs::canonicalize(&place).unwrap_or(place);
-            if let Some((other, _)) = taken.iter().find(|(_, other)| *other == place) {
-                return Err(Error::mismatch(format!("{other} and {flag} name the same file")).in_file(path));
-            }
-            taken.push((flag, place));
-        }
-        Ok(())
     }
 
     fn predictors(&self, set: &dyn DataSet, data: &Named) -> Result<Vec<Predictor>> {
@@ -205,7 +201,7 @@ impl Eval {
     }
 
     fn report(&self, summary: &Summary) -> Result<()> {
-        print!("{}", summary.text());
+        terminal::write(format_args!("{}", summary.text()))?;
         if let Some(path) = &self.json {
             summary.write_json(path)?;
         }

@@ -1,7 +1,7 @@
 //! What commands share that run frames: model, scene, rig and session from files.
 
 use super::{Machine, terminal};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use voxcast::camera::{Camera, read_calibration_with_notes};
 use voxcast::rig::RigBuilder;
@@ -39,6 +39,45 @@ pub fn check_output(path: &Path) -> Result<()> {
         Ok(_) => Err(Error::new(ErrorKind::Io, "cannot write: not a regular file in a directory").in_file(path)),
         Err(e) => Err(Error::io(path, "write", &e)),
     }
+}
+
+/// Makes a directory, and those that it lies in, where they are not there.
+pub fn create_directory(path: &Path) -> Result<()> {
+    if path.exists() && !path.is_dir() {
+        return Err(Error::new(ErrorKind::Io, "cannot create: a file is there, expected a directory").in_file(path));
+    }
+    std::fs::create_dir_all(path).map_err(|e| Error::io(path, "create", &e))
+}
+
+/// Refuses outputs that cannot be written, as [`check_output`] does, and one in the place of another or of an input, of which the
+/// last would be left. Each has the name by which the command line knows it.
+pub fn check_outputs<'a, P: AsRef<Path> + 'a>(
+    inputs: impl IntoIterator<Item = (&'a str, P)>,
+    outputs: impl IntoIterator<Item = (&'a str, P)>,
+) -> Result<()> {
+    let place = |path: &Path| {
+        let place = std::path::absolute(path).map_err(|e| Error::io(path, "find", &e))?;
+        Ok(std::fs::canonicalize(&place).unwrap_or(place))
+    };
+    let mut taken = Vec::new();
+    for (name, path) in inputs {
+        taken.push((name, place(path.as_ref())?));
+    }
+    for (name, path) in outputs {
+        let path = path.as_ref();
+        check_output(path)?;
+        let place = place(path)?;
+        if let Some((other, _)) = taken.iter().find(|(_, other)| *other == place) {
+            return Err(Error::mismatch(format!("{other} and {name} name the same file")).in_file(path));
+        }
+        taken.push((name, place));
+    }
+    Ok(())
+}
+
+/// An argument that may be missing, for [`check_outputs`].
+pub fn named<'a>(name: &'a str, path: Option<&'a PathBuf>) -> Option<(&'a str, &'a Path)> {
+    path.map(|path| (name, path.as_path()))
 }
 
 /// Which rig a command uses.

@@ -72,11 +72,11 @@ impl Frames {
     }
 
     pub fn of_log(run: &Run, network: &Network) -> Result<Self> {
-        let options = ReplayOptions {
-            cameras: run.camera.clone(),
-            frame: run.frame.clone(),
-            tolerance: u64::from(run.tolerance) * 1_000_000,
-        };
+        let (cameras, frame) = (run.camera.clone(), run.frame.clone());
+        let mut options = ReplayOptions { cameras, frame, ..ReplayOptions::default() };
+        if let Some(milliseconds) = run.tolerance {
+            options.tolerance = u64::from(milliseconds) * 1_000_000;
+        }
         let replay = Box::new(Replay::open(&run.scene, network, &options)?);
         Ok(Frames::Log { path: run.scene.clone(), replay })
     }
@@ -152,7 +152,11 @@ impl Results {
         if is_log(path) {
             return Ok(Results::Log(Box::new(LogWriter::create(path, network)?)));
         }
-        std::fs::create_dir_all(path).map_err(|e| Error::io(path, "create", &e))?;
+        if path.extension().is_some_and(|e| e.eq_ignore_ascii_case("npz")) {
+            let message = "one file for many frames, expected a directory for one .npz each, or a log (.mcap)";
+            return Err(Error::mismatch(message).in_file(path));
+        }
+        frame::create_directory(path)?;
         Ok(Results::Directory(path.clone()))
     }
 

@@ -1,6 +1,7 @@
 //! `voxcast import`
 
-use super::{ThreadCount, calibrate, terminal};
+use super::terminal::tell;
+use super::{ThreadCount, calibrate, frame, terminal};
 use clap::{Args, CommandFactory};
 use indicatif::ProgressBar;
 use std::path::{Path, PathBuf};
@@ -86,14 +87,25 @@ const MIXED_FRAMES: usize = 2;
 
 impl Import {
     pub fn run(self) -> Result<()> {
+        let inputs = [Some(&self.checkpoint), self.ranges.as_ref()];
+        let inputs = ["CHECKPOINT", "--ranges"].into_iter().zip(inputs);
+        frame::check_outputs(inputs.filter_map(|(name, path)| Some((name, path?))), [("--output", &self.output)])?;
         let given = self.precision.as_deref().and_then(Precision::parse);
         match self.model()? {
+            Some(model) if model.quantisation().is_some() => {
+                let message = "a model of int8, expected a checkpoint, or a model of f32 or f16";
+                Err(Error::mismatch(message).in_file(&self.checkpoint))
+            }
             Some(model) => {
                 let precision = given.unwrap_or(model.options().precision);
                 self.check_usage(precision);
                 let network = self.network.as_deref().map(read_network).transpose()?;
                 if network.is_some_and(|network| network != *model.network()) {
-                    return Err(Error::mismatch("--network is not the model's").in_file(&self.checkpoint));
+                    let message = format!(
+                        "--network {} is not the model's network, expected that or no --network",
+                        self.network.as_deref().unwrap_or_default()
+                    );
+                    return Err(Error::mismatch(message).in_file(&self.checkpoint));
                 }
                 if precision == model.options().precision && self.fold == "all" && !self.exact {
                     let bar = terminal::progress("transforming", 0);
@@ -189,13 +201,13 @@ impl Import {
         terminal::say(notes);
         let model = Model::open(&self.output)?;
         terminal::say(&Vec::from_iter(offsets_note(&model, asked)));
-        println!(
+        tell!(
             "{}: {} weights, {}, checksum {:016x}",
             self.output.display(),
             model.options().precision.name(),
             terminal::bytes(model.file_size()),
             model.checksum().unwrap_or_default()
-        );
+        )?;
         Ok(())
     }
 
@@ -208,13 +220,13 @@ impl Import {
         let bar = terminal::progress("mixing", mixed.runs());
         let choice = mixed.find(target, &mut |done| bar.set_position(done as u64))?;
         bar.finish_and_clear();
-        println!(
+        tell!(
             "logits at {:.1} dB, {} operations in f32 (all int8: {:.1} dB): {}",
             choice.snr,
             choice.keep_f32.len(),
             choice.least,
             choice.keep_f32.join(",")
-        );
+        )?;
         Ok(choice.keep_f32)
     }
 

@@ -1,5 +1,6 @@
 //! `voxcast inspect`
 
+use super::terminal::tell;
 use super::{ThreadCount, terminal};
 use clap::Args;
 use std::path::PathBuf;
@@ -98,51 +99,51 @@ impl Inspect {
                     "executed_multiply_adds": graph.executed_multiply_adds(row.operation),
                 })).collect::<Vec<_>>(),
             });
-            println!("{value:#}");
+            tell!("{value:#}")?;
             return Ok(());
         }
         let [x, y, z] = network.output_grid();
-        println!("model      {}", self.file.display());
-        println!("checksum   {:016x}", model.checksum().unwrap_or_default());
-        println!(
+        tell!("model      {}", self.file.display())?;
+        tell!("checksum   {:016x}", model.checksum().unwrap_or_default())?;
+        tell!(
             "weights    {} numbers, {} (batch norms {}, projection {}, {})",
             parameters,
             model.options().precision.name(),
             if rewrites.batch_norm { "folded" } else { "kept" },
             if rewrites.projection { "folded" } else { "kept" },
             if rewrites.winograd { "Winograd where it pays" } else { "direct sums" }
-        );
+        )?;
         if let Some(quantisation) = model.quantisation() {
             let asked = match quantisation.keep_f32.is_empty() {
                 true => String::new(),
                 false => format!(", by name: {}", quantisation.keep_f32.join(",")),
             };
-            println!(
+            tell!(
                 "int8       {} tensors with a scale; in f32: {} operations{asked}",
                 quantisation.scales.len(),
                 kept.len()
-            );
+            )?;
         }
-        println!("confidence softmax at temperature {}", model.temperature());
-        println!("file       {}", terminal::bytes(model.file_size()));
-        println!("images     {} x {} (height x width, padded)", network.image[0], network.image[1]);
-        println!("output     {x} x {y} x {z} voxels, {} classes", network.classes);
-        println!(
+        tell!("confidence softmax at temperature {}", model.temperature())?;
+        tell!("file       {}", terminal::bytes(model.file_size()))?;
+        tell!("images     {} x {} (height x width, padded)", network.image[0], network.image[1])?;
+        tell!("output     {x} x {y} x {z} voxels, {} classes", network.classes)?;
+        tell!(
             "work       {:.1} GMAC a frame of {cameras} cameras, of which {:.1} are executed",
             multiply_adds as f64 / 1e9,
             executed as f64 / 1e9
-        );
-        println!(
+        )?;
+        tell!(
             "session    {} bytes for {cameras} cameras and {} threads: arena {}, output {}",
             memory.total(),
             options.threads.count(),
             memory.arena,
             memory.output
-        );
-        println!("network    {}", network.to_json());
+        )?;
+        tell!("network    {}", network.to_json())?;
         if self.operations {
             for (i, row) in operations.iter().enumerate() {
-                println!(
+                tell!(
                     "{:>4} {:60} {:18} {:>8} {:>3} {:?} x {:<5} {:>9} weights {:>9} {:>8.3} GMAC {:>8.3} executed{}",
                     i,
                     row.operation.name,
@@ -156,15 +157,15 @@ impl Inspect {
                     graph.multiply_adds(row.operation) as f64 / 1e9,
                     graph.executed_multiply_adds(row.operation) as f64 / 1e9,
                     if i < graph.camera_operations { " per camera" } else { "" }
-                );
+                )?;
             }
         }
         if self.plan {
-            print!("{}", voxcast::plan::Plan::new(&graph, cameras, options.threads.count())?);
+            terminal::write(format_args!("{}", voxcast::plan::Plan::new(&graph, cameras, options.threads.count())?))?;
         }
         if self.tensors {
             for (name, dtype, len) in model.tensors() {
-                println!("{name:70} {dtype:?} {len}");
+                tell!("{name:70} {dtype:?} {len}")?;
             }
         }
         Ok(())
@@ -189,23 +190,23 @@ impl Inspect {
                     "bev": {"rows": l.bev.ptr.len() - 1, "entries": l.bev.col.len()},
                 })).collect::<Vec<_>>(),
             });
-            println!("{value:#}");
+            tell!("{value:#}")?;
             return Ok(());
         }
-        println!("rig        {}", self.file.display());
-        println!("checksum   {:016x}", container.checksum().unwrap_or_default());
-        println!("file       {}", terminal::bytes(container.bytes().len()));
-        println!("cameras    {}", rig.cameras());
+        tell!("rig        {}", self.file.display())?;
+        tell!("checksum   {:016x}", container.checksum().unwrap_or_default())?;
+        tell!("file       {}", terminal::bytes(container.bytes().len()))?;
+        tell!("cameras    {}", rig.cameras())?;
         for (i, level) in levels.iter().enumerate() {
             for (name, matrix) in [("volume", level.volume), ("bev", level.bev)] {
                 let empty = matrix.ptr.windows(2).filter(|w| w[0] == w[1]).count();
-                println!(
+                tell!(
                     "level {}    {name:6} {} rows, {} empty, {} entries",
                     i + 1,
                     matrix.ptr.len() - 1,
                     empty,
                     matrix.col.len()
-                );
+                )?;
             }
         }
         Ok(())

@@ -77,6 +77,11 @@ enum Command {
     Eval(eval::Eval),
 }
 
+/// Says why the program failed.
+pub fn complain(error: &Error) {
+    terminal::complain(format_args!("{error}"));
+}
+
 impl Arguments {
     pub fn run(self) -> Result<()> {
         match self.command {

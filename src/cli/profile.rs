@@ -1,5 +1,6 @@
 //! `voxcast profile`
 
+use super::terminal::tell;
 use super::{Machine, frame, terminal};
 use clap::Args;
 use std::collections::BTreeMap;
@@ -100,6 +101,10 @@ struct Sliced {
 
 impl Profile {
     pub fn run(self) -> Result<()> {
+        let inputs = [Some(&self.model), self.rig.as_ref(), Some(&self.scene)];
+        let inputs = ["--model", "--rig", "SCENE"].into_iter().zip(inputs);
+        let trace = self.trace.iter().map(|path| ("--trace", path));
+        frame::check_outputs(inputs.filter_map(|(name, path)| Some((name, path?))), trace)?;
         let (model, scene, notes) = frame::open(&self.model, &self.scene)?;
         terminal::say(&notes);
         let mut options = frame::options(&self.machine)?;
@@ -151,7 +156,7 @@ impl Profile {
         let rows = self.rows(&graph, &seconds, &longest, images.len());
         let worst = (0..longest.len()).max_by(|&a, &b| longest[a].total_cmp(&longest[b]));
         let worst = worst.map_or("", |index| &graph.operations[index].name);
-        self.print(rows, frame, peaks, options.threads.count(), sliced.slices, worst);
+        self.print(rows, frame, peaks, options.threads.count(), sliced.slices, worst)?;
         Ok(())
     }
 
@@ -185,7 +190,15 @@ impl Profile {
         rows
     }
 
-    fn print(&self, rows: Vec<Row>, frame: f64, peaks: [Option<f64>; 2], threads: usize, slices: usize, worst: &str) {
+    fn print(
+        &self,
+        rows: Vec<Row>,
+        frame: f64,
+        peaks: [Option<f64>; 2],
+        threads: usize,
+        slices: usize,
+        worst: &str,
+    ) -> Result<()> {
         let total: u64 = rows.iter().map(|r| r.multiply_adds).sum();
         let total_executed = [0, 1].map(|kind| rows.iter().map(|r| r.executed[kind]).sum::<u64>());
         let longest = rows.iter().map(|r| r.slice).fold(0.0, f64::max);
@@ -208,13 +221,18 @@ impl Profile {
                 "integer_multiply_adds": total_executed[1], "rows": rows, "slices": slices,
                 "longest_slice_seconds": longest, "longest_slice_operation": worst,
             });
-            println!("{value:#}");
-            return;
+            return tell!("{value:#}");
         }
-        println!(
+        tell!(
             "{:58} {:>10} {:>6} {:>9} {:>9} {:>6} {:>10}",
-            self.by, "median", "share", "GMAC", "GMAC/s", "peak", "slice"
-        );
+            self.by,
+            "median",
+            "share",
+            "GMAC",
+            "GMAC/s",
+            "peak",
+            "slice"
+        )?;
         for (s, Row { name, slice, multiply_adds: work, executed, .. }) in &rows {
             let rate = *work as f64 / s;
             let (gmac, rate, share) = if *work == 0 {
@@ -224,14 +242,14 @@ impl Profile {
                 let share = at_peak(executed, &peaks) / s;
                 (gmac, format!("{:.1}", rate / 1e9), format!("{:.0} %", 100.0 * share))
             };
-            println!(
+            tell!(
                 "{name:58} {:>10} {:>5.1}% {gmac:>9} {rate:>9} {share:>6} {:>10}",
                 terminal::time(Duration::from_secs_f64(*s)),
                 100.0 * s / frame,
                 terminal::time(Duration::from_secs_f64(*slice))
-            );
+            )?;
         }
-        println!(
+        tell!(
             "frame {} on {threads} threads, {:.1} GMAC, {:.1} GMAC/s, {:.0} % of the measured peak of {}",
             terminal::time(Duration::from_secs_f64(frame)),
             total as f64 / 1e9,
@@ -243,12 +261,12 @@ impl Profile {
                 }
                 [peak, _] => format!("{:.1} GMAC/s", peak.unwrap_or_default() / 1e9),
             }
-        );
-        println!(
+        )?;
+        tell!(
             "in steps: {slices} slices of about {} million multiply-adds, the longest {} in {worst}",
             self.slice,
             terminal::time(Duration::from_secs_f64(longest))
-        );
+        )
     }
 }
 

@@ -1,5 +1,6 @@
 //! `voxcast rig`
 
+use super::terminal::tell;
 use super::{Machine, frame, import, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
@@ -25,7 +26,7 @@ pub struct BuildRig {
     /// The model whose network the matrices are for
     #[arg(long, required_unless_present = "network")]
     model: Option<PathBuf>,
-    /// The network, where there is no model yet: nuscenes-200, nuscenes-256, semantickitti-256, or a network.json
+    /// The network, where there is no model yet: nuscenes-200, nuscenes-256, semantickitti-256, edge, or a network.json
     #[arg(long, value_name = "NAME|FILE.json", conflicts_with = "model")]
     network: Option<String>,
     /// The rig to write
@@ -40,6 +41,9 @@ pub struct BuildRig {
 
 impl BuildRig {
     pub fn run(self) -> Result<()> {
+        let inputs = [Some(&self.scene), self.model.as_ref()];
+        let inputs = ["SCENE", "--model"].into_iter().zip(inputs);
+        frame::check_outputs(inputs.filter_map(|(name, path)| Some((name, path?))), [("--output", &self.output)])?;
         let network = self.network()?;
         let (names, lidar2img) = frame::calibration(&self.scene, &network)?;
         let threads = self.machine.threads()?;
@@ -68,24 +72,24 @@ impl BuildRig {
                 "notes": notes.iter().map(ToString::to_string).collect::<Vec<_>>(),
                 "seconds": elapsed.as_secs_f64(),
             });
-            println!("{value}");
+            tell!("{value}")?;
             return Ok(());
         }
         for index in 0..3 {
             let level = rig.level(index);
             for (name, matrix) in [("volume", level.volume), ("bev", level.bev)] {
                 let (rows, entries) = (matrix.ptr.len() - 1, matrix.col.len());
-                println!(
+                tell!(
                     "level {} {name:6} {rows:>9} rows {entries:>10} entries {:>7.1} a row",
                     index + 1,
                     entries as f64 / rows as f64
-                );
+                )?;
             }
         }
         let shares = names.iter().zip(&visibility.cameras);
         let shares: Vec<String> = shares.map(|(name, &share)| format!("{name} {}", terminal::percent(share))).collect();
-        println!("cameras see {} of the voxels: {}", terminal::percent(visibility.seen), shares.join(", "));
-        println!("six matrices in {} on {} threads", terminal::time(elapsed), threads.count());
+        tell!("cameras see {} of the voxels: {}", terminal::percent(visibility.seen), shares.join(", "))?;
+        tell!("six matrices in {} on {} threads", terminal::time(elapsed), threads.count())?;
         Ok(())
     }
 

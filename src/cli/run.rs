@@ -1,6 +1,7 @@
 //! `voxcast run`
 
 use super::dump::Dump;
+use super::terminal::tell;
 use super::view::name_of;
 use super::{Machine, frame, terminal};
 use clap::Args;
@@ -95,8 +96,9 @@ pub struct Run {
     #[arg(long, value_name = "NAME")]
     pub(super) frame: Option<String>,
     /// Of a log: by how much later than its first image the others of a frame may be, less than a camera's period
-    #[arg(long, value_name = "MILLISECONDS", default_value_t = 50, value_parser = clap::value_parser!(u32).range(0..=10_000))]
-    pub(super) tolerance: u32,
+    /// [default: 50]
+    #[arg(long, value_name = "MILLISECONDS", value_parser = clap::value_parser!(u32).range(0..=10_000))]
+    pub(super) tolerance: Option<u32>,
     /// Leave cameras out, by name or number from 0, separated by commas: as if the rig had them not
     #[arg(long, value_name = "CAMERAS", value_delimiter = ',')]
     pub(super) mask: Vec<String>,
@@ -138,9 +140,7 @@ impl Run {
             return Err(Error::mismatch(message).in_file(&self.scene));
         }
         let start = Instant::now();
-        for path in [Some(&self.output), self.png.as_ref(), self.html.as_ref()].into_iter().flatten() {
-            frame::check_output(path)?;
-        }
+        self.check_outputs(Some(&self.output))?;
         let (model, scene, mut notes) = frame::open(&self.model, &self.scene)?;
         let mut dump = self.dump.as_ref().map(|_| Dump::new(self.stages.as_deref(), model.network())).transpose()?;
         let mut options = frame::options(&self.machine)?;
@@ -194,13 +194,27 @@ impl Run {
             dump.finish(directory, &rig, result.grid, result.classes)?;
         }
         let summary = Summary { loaded, rig_time, mapped: self.rig.is_some(), frame_time, notes };
-        summary.print(network, &result, self.json);
-        Ok(())
+        summary.print(network, &result, self.json)
     }
 
     /// Whether it is asked how sure the network is.
     pub(super) fn wants_confidence(&self) -> bool {
         self.confidence || self.hide_below.is_some()
+    }
+
+    /// Refuses files to write that cannot be written, or that are read or written under another name.
+    /// `output` is what `--output` names, if that is a file.
+    pub(super) fn check_outputs(&self, output: Option<&PathBuf>) -> Result<()> {
+        let named = frame::named;
+        let inputs =
+            [named("--model", Some(&self.model)), named("--rig", self.rig.as_ref()), named("SCENE", Some(&self.scene))];
+        let outputs = [
+            named("--output", output),
+            named("--png", self.png.as_ref()),
+            named("--html", self.html.as_ref()),
+            named("--animation", self.animation.as_ref()),
+        ];
+        frame::check_outputs(inputs.into_iter().flatten(), outputs.into_iter().flatten())
     }
 
     pub(super) fn rig_file(&self) -> frame::RigFile<'_> {
@@ -303,7 +317,7 @@ struct Summary {
 }
 
 impl Summary {
-    fn print(&self, network: &Network, result: &Occupancy<'_>, json: bool) {
+    fn print(&self, network: &Network, result: &Occupancy<'_>, json: bool) -> Result<()> {
         let mut counts = vec![0usize; network.classes];
         result.classes.iter().for_each(|&class| counts[usize::from(class)] += 1);
         let digest = digest(result);
@@ -322,26 +336,25 @@ impl Summary {
                     "frame": self.frame_time.as_secs_f64(),
                 },
             });
-            println!("{value}");
-            return;
+            return tell!("{value}");
         }
         let [x, y, z] = result.grid.size;
         let occupied = result.classes.len() - counts[0];
-        println!(
+        tell!(
             "{x}x{y}x{z} voxels, {occupied} occupied ({}), digest {digest}",
             terminal::percent(occupied as f64 / result.classes.len() as f64)
-        );
-        println!("cameras see {} of the voxels", terminal::percent(seen(result)));
+        )?;
+        tell!("cameras see {} of the voxels", terminal::percent(seen(result)))?;
         if let Some(logits) = logits {
-            println!("logits digest {logits}");
+            tell!("logits digest {logits}")?;
         }
-        println!(
+        tell!(
             "load {}, {} rig {}, frame {}",
             terminal::time(self.loaded),
             if self.mapped { "map" } else { "build" },
             terminal::time(self.rig_time),
             terminal::time(self.frame_time)
-        );
+        )
     }
 }
 

@@ -1,5 +1,6 @@
 //! `voxcast selftest`
 
+use super::terminal::tell;
 use super::{Machine, terminal};
 use clap::Args;
 use std::path::PathBuf;
@@ -46,19 +47,19 @@ impl SelfTest {
                 })
             });
             let (operations, seconds) = (report.operations, elapsed.as_secs_f64());
-            println!("{}", serde_json::json!({"operations": operations, "fault": fault, "seconds": seconds}));
+            tell!("{}", serde_json::json!({"operations": operations, "fault": fault, "seconds": seconds}))?;
         }
         if let Some(fault) = report.fault {
             return Err(Error::new(ErrorKind::Mismatch, format!("self-test failed: {fault}")).in_file(&self.model));
         }
         if !self.json {
-            println!(
+            tell!(
                 "{} operations give what they must, in {} on {} threads with {}",
                 report.operations,
                 terminal::time(elapsed),
                 threads.count(),
                 isa.name()
-            );
+            )?;
         }
         Ok(())
     }

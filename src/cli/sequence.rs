@@ -4,6 +4,7 @@ use super::frame;
 use super::frames::{self, Frame, Frames, Results};
 use super::run::{Run, digest, draw, masked, seen, title};
 use super::terminal;
+use super::terminal::tell;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -52,8 +53,8 @@ impl Run {
         if frames::is_log(&self.scene) {
             return self.run_sequence(None);
         }
-        if !self.camera.is_empty() || self.frame.is_some() {
-            let message = "--camera and --frame are about logs, and this is none (.mcap)";
+        if !self.camera.is_empty() || self.frame.is_some() || self.tolerance.is_some() {
+            let message = "--camera, --frame and --tolerance are about logs, and this is none (.mcap)";
             return Err(Error::mismatch(message).in_file(&self.scene));
         }
         if let Some(scenes) = scenes(&self.scene)? {
@@ -79,9 +80,7 @@ impl Run {
                 return Err(Error::mismatch(message).in_file(&self.scene));
             }
         }
-        if let Some(path) = &self.animation {
-            frame::check_output(path)?;
-        }
+        self.check_outputs(Some(&self.output).filter(|path| frames::is_log(path)))?;
         let model = Arc::new(Model::open(&self.model)?);
         let mut frames = match scenes {
             Some(scenes) => Frames::of_scenes(scenes)?,
@@ -144,8 +143,7 @@ impl Run {
             animation.finish()?;
         }
         let rigs = driver.map_or((0, Duration::ZERO), |driver| (driver.moving.rigs, driver.moving.rig_time));
-        self.print_sequence(&done, frames.summary(), rigs, said.notes());
-        Ok(())
+        self.print_sequence(&done, frames.summary(), rigs, said.notes())
     }
 
     fn print_sequence(
@@ -154,7 +152,7 @@ impl Run {
         log: Option<&Summary>,
         (rigs, rig_time): (usize, Duration),
         notes: &[Note],
-    ) {
+    ) -> Result<()> {
         let latency = Latency::of(done.iter().map(|done| done.frame));
         let read = Latency::of(done.iter().map(|done| done.read));
         let all: String = done.iter().map(|done| done.digest.as_str()).collect();
@@ -196,29 +194,30 @@ impl Run {
                     "without_transform": log.without_transform,
                 });
             }
-            println!("{value}");
-            return;
+            return tell!("{value}");
         }
         let what = if log.is_some() { "frames" } else { "scenes" };
-        println!("{} {what} with one session, digest {all}", done.len());
+        tell!("{} {what} with one session, digest {all}", done.len())?;
         let shares = || done.iter().map(|done| done.seen);
-        println!(
+        tell!(
             "cameras see {} to {} of the voxels",
             terminal::percent(shares().fold(1.0, f64::min)),
             terminal::percent(shares().fold(0.0, f64::max))
-        );
+        )?;
         if let Some(log) = log {
-            println!("log {}", log.extent);
+            tell!("log {}", log.extent)?;
             let cameras: Vec<String> = log.cameras.iter().map(|(name, topic)| format!("{name} {topic}")).collect();
-            println!("cameras in frame {}: {}", log.frame, cameras.join(", "));
-            println!(
+            tell!("cameras in frame {}: {}", log.frame, cameras.join(", "))?;
+            tell!(
                 "{} frames lack an image, {} images belong to no frame, {} frames have no transform at their time",
-                log.incomplete, log.left_out, log.without_transform
-            );
+                log.incomplete,
+                log.left_out,
+                log.without_transform
+            )?;
         }
-        println!("frame {latency}");
-        println!("reading a {} {read}", if log.is_some() { "frame" } else { "scene" });
-        println!("rigs: {rigs}, in {}", terminal::time(rig_time));
+        tell!("frame {latency}")?;
+        tell!("reading a {} {read}", if log.is_some() { "frame" } else { "scene" })?;
+        tell!("rigs: {rigs}, in {}", terminal::time(rig_time))
     }
 }
 

@@ -1,11 +1,13 @@
 //! `voxcast synth`
 
 use super::import::read_network;
+use super::terminal::tell;
 use super::{ThreadCount, frame, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
+use voxcast::container::Container;
 use voxcast::network::Grid;
 use voxcast::synth::{Synthesiser, set_file};
 use voxcast::{Error, Result};
@@ -63,21 +65,23 @@ impl Synth {
             return self.write_set(&synthesiser, directory, workers);
         }
         let output = self.output.as_deref().unwrap_or(Path::new("."));
+        frame::create_directory(output)?;
         let grid = Grid::of(synthesiser.network());
         let Some(frames) = self.frames.map(|n| n as usize) else {
             synthesiser.frame(self.seed).save_scene(output, grid)?;
-            println!("scene of seed {} in {}", self.seed, output.display());
+            tell!("scene of seed {} in {}", self.seed, output.display())?;
             return Ok(());
         };
         work("frames", frames as u64, workers, |index| {
             let frame = synthesiser.frame_of(self.seed, index as usize, frames);
             frame.save_scene(&output.join(format!("{index:03}")), grid)
         })?;
-        println!("{frames} scenes of seed {} in {}", self.seed, output.display());
+        tell!("{frames} scenes of seed {} in {}", self.seed, output.display())?;
         Ok(())
     }
 
     fn write_set(&self, synthesiser: &Synthesiser, directory: &Path, workers: usize) -> Result<()> {
+        frame::create_directory(directory)?;
         synthesiser.begin_set(directory)?;
         let grid = Grid::of(synthesiser.network());
         let last = self.seed.checked_add(self.count).filter(|&end| end <= 1_000_000_000);
@@ -88,10 +92,22 @@ impl Synth {
             let seed = self.seed + index;
             let path = directory.join(set_file(seed));
             // Files appear whole or not at all.
-            if path.exists() { Ok(()) } else { synthesiser.frame(seed).save_tensors(&path, grid, self.pixels) }
+            match path.exists() {
+                true if self.pixels => has_pixels(&path),
+                true => Ok(()),
+                false => synthesiser.frame(seed).save_tensors(&path, grid, self.pixels),
+            }
         })?;
-        println!("{} frames in {}", self.count, directory.display());
+        tell!("{} frames in {}", self.count, directory.display())?;
         Ok(())
+    }
+}
+
+/// Refuses a frame that was drawn before and lacks what is asked for now.
+fn has_pixels(path: &Path) -> Result<()> {
+    match Container::open(path)?.tensor("pixel.class") {
+        Some(_) => Ok(()),
+        None => Err(Error::mismatch("it was drawn without --pixels, expected tensor \"pixel.class\"").in_file(path)),
     }
 }
 

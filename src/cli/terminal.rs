@@ -1,14 +1,37 @@
 //! What the user sees while work goes on, and how sizes and times are written.
 
 use indicatif::{ProgressBar, ProgressStyle};
+use std::fmt::Arguments;
+use std::io::{ErrorKind, Write};
+use std::path::Path;
 use std::time::Duration;
-use voxcast::Note;
+use voxcast::{Error, Note, Result};
+
+/// A line for standard output, formatted as by `println!`, which panics where this returns an error.
+macro_rules! tell {
+    ($($arguments:tt)*) => {
+        $crate::cli::terminal::write(format_args!("{}\n", format_args!($($arguments)*)))
+    };
+}
+pub(crate) use tell;
+
+/// Writes to standard output. A reader that has gone, such as `head`, wants no more of it: that is no error, and whatever else
+/// the command does goes on.
+pub fn write(text: Arguments<'_>) -> Result<()> {
+    match std::io::stdout().lock().write_fmt(text) {
+        Err(e) if e.kind() != ErrorKind::BrokenPipe => Err(Error::io(Path::new("standard output"), "write", &e)),
+        _ => Ok(()),
+    }
+}
 
 /// Says what was not obeyed or hardly ever meant, one line each, where errors go too.
 pub fn say(notes: &[Note]) {
-    for note in notes {
-        eprintln!("voxcast: note: {note}");
-    }
+    notes.iter().for_each(|note| complain(format_args!("note: {note}")));
+}
+
+/// A line on standard error. Where that cannot be written, there is nobody to say it to.
+pub fn complain(line: Arguments<'_>) {
+    let _ = writeln!(std::io::stderr().lock(), "voxcast: {line}");
 }
 
 /// A share as people read it.

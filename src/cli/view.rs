@@ -1,5 +1,6 @@
 //! `voxcast view`
 
+use super::terminal::tell;
 use super::{frame, import::read_network, terminal};
 use clap::Args;
 use std::path::{Path, PathBuf};
@@ -45,7 +46,9 @@ pub struct View {
 impl View {
     pub fn run(self) -> Result<()> {
         let output = self.output.unwrap_or_else(|| self.result.with_extension("html"));
-        frame::check_output(&output)?;
+        let inputs = [Some(&self.result), self.scene.as_ref(), self.truth.as_ref()];
+        let inputs = ["OUT.npz", "--scene", "--truth"].into_iter().zip(inputs);
+        frame::check_outputs(inputs.filter_map(|(name, path)| Some((name, path?))), [("--output", &output)])?;
         let network = self.network.as_deref().map(read_network).transpose()?;
         let stored = Stored::read(&self.result, network.as_ref()).map_err(|e| e.in_file(&self.result))?;
         let scene = self.scene.as_deref().map(Scene::open_with_notes).transpose()?;
@@ -65,7 +68,7 @@ impl View {
         };
         page.write(&output).map_err(|e| if e.path().is_some() { e } else { e.in_file(&self.result) })?;
         let length = std::fs::metadata(&output).map_or(0, |m| m.len());
-        println!("{} of {}, to open in a browser", output.display(), terminal::bytes(length as usize));
+        tell!("{} of {}, to open in a browser", output.display(), terminal::bytes(length as usize))?;
         Ok(())
     }
 }

@@ -26,6 +26,7 @@ pub use uniocc::UniOcc;
 
 pub use crate::network::{Axes, Grid};
 
+use crate::base::digest::Digest;
 use crate::base::error::{Error, Result};
 use crate::base::note::Note;
 use crate::scene::Scene;
@@ -56,6 +57,20 @@ pub struct Truth {
 }
 
 impl Truth {
+    /// XXH3-64 of all of it. What has another digest gives another score, or might.
+    pub fn digest(&self) -> u64 {
+        let mut digest = Digest::new();
+        let mut part = |bytes: &[u8]| {
+            digest.add(&(bytes.len() as u64).to_le_bytes());
+            digest.add(bytes);
+        };
+        part(&self.labels);
+        self.masks.iter().for_each(|mask| part(mask));
+        let numbers = self.origins.as_flattened().iter().copied().chain(self.grid_to_lidar.numbers());
+        part(&numbers.flat_map(f64::to_le_bytes).collect::<Vec<u8>>());
+        digest.finish()
+    }
+
     /// Labels without masks in the lidar's frame: the lidar is where its metres begin.
     fn of_lidar(labels: Vec<u8>) -> Self {
         Self { labels, masks: vec![], origins: vec![[0.0; 3]], grid_to_lidar: Pose::IDENTITY }

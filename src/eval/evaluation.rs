@@ -1,6 +1,6 @@
 //! A whole evaluation: frames of a data set, several at a time, each with all its predictors.
 
-use super::dataset::{DataSet, Frame, Grid};
+use super::dataset::{DataSet, Grid};
 use super::journal::{Entry, Header, Journal};
 use super::subject::{Scope, Subject};
 use super::summary::Summary;
@@ -151,16 +151,28 @@ impl Evaluation {
         self.header.shard.frames(self.frames).filter(|&index| !totals.has(index)).collect()
     }
 
-    /// Opens the journal at `path`, or begins it, and counts the frames that it has.
+    /// Opens the journal at `path`, or begins it, and counts the frames that it has. Their labels are read, and must be those
+    /// against which the frames were scored. `watch` is told of each frame how many have been counted; what it returns as an
+    /// error ends that.
     ///
     /// # Errors
-    /// Those of [`Journal::open`].
-    pub fn resume(&self, path: &Path, totals: &mut Totals) -> Result<Journal> {
+    /// Those of [`Journal::open`], of [`DataSet::truth`] and of `watch`; [`ErrorKind::Mismatch`](crate::ErrorKind::Mismatch) if the
+    /// labels of a frame have changed.
+    pub fn resume(
+        &self,
+        path: &Path,
+        totals: &mut Totals,
+        watch: &mut dyn FnMut(usize) -> Result<()>,
+    ) -> Result<Journal> {
+        let mut counted = 0;
         Journal::open(path, &self.header, &mut |entry| {
             self.check_name(&entry)?;
             // A journal of a higher limit has more frames.
             if entry.index < self.frames && !totals.has(entry.index) {
+                self.check_truth(&entry)?;
                 totals.add(entry.index, entry.score);
+                counted += 1;
+                watch(counted)?;
             }
             Ok(())
         })
@@ -191,6 +203,20 @@ impl Evaluation {
             return Ok(());
         }
         Err(Error::format(format!("frame {} is {found:?}, expected {expected:?}", entry.index)))
+    }
+
+    /// Refuses an entry that was scored against other labels than the set has now.
+    fn check_truth(&self, entry: &Entry) -> Result<()> {
+        let (found, expected) = (entry.truth, self.set.truth(entry.index)?.digest());
+        if found == expected {
+            return Ok(());
+        }
+        let message = format!(
+            "frame {} was scored against other labels than the set has now: digest {found:016x}, expected {expected:016x}; \
+             score into another file",
+            entry.frame
+        );
+        Err(Error::mismatch(message))
     }
 
     /// Scores the frames that `totals` lacks, and counts them. `watch` is told how many are done and what of their images has
@@ -296,14 +322,9 @@ impl Worker {
     /// If there is no such frame.
     pub fn score(&mut self, index: usize) -> Result<Entry> {
         let Evaluation { set, predictors, .. } = &*self.evaluation;
-        let blind = predictors.iter().all(|(predictor, _)| matches!(predictor.says, Says::Always(..)));
-        let (scene, truth) = if blind {
-            (None, set.truth(index)?)
-        } else {
-            let Frame { scene, truth, notes } = set.frame(index)?;
-            self.notes.extend(notes);
-            (Some(scene), truth)
-        };
+        let truth = set.truth(index)?;
+        // Read for the first model: who looks at no image needs none.
+        let mut scene: Option<Scene> = None;
         let said = |e: Error| match e.path() {
             Some(_) => e,
             None => Error::new(e.kind(), format!("frame {}: {}", set.id(index), e.message())),
@@ -311,15 +332,21 @@ impl Worker {
         let mut score = FrameScore { digests: Vec::new(), scores: Vec::new(), agreement: None };
         let mut on_truth: Vec<Vec<u8>> = Vec::new();
         for ((Predictor { says, .. }, scorer), running) in predictors.iter().zip(&mut self.running) {
-            let prediction = match (says, &scene) {
-                (Says::Model(model), Some(scene)) => {
+            let prediction = match says {
+                Says::Model(model) => {
+                    let scene = match &mut scene {
+                        Some(scene) => scene,
+                        none => {
+                            let (read, notes) = set.scene(index)?;
+                            self.notes.extend(notes);
+                            none.insert(read)
+                        }
+                    };
                     let Occupancy { classes, support, logits, confidence, .. } =
                         run(running, model, scene, &self.options).map_err(said)?;
                     Prediction { classes, support: Some(support), logits, confidence }
                 }
-                (Says::Always(classes, _), _) => Prediction { classes, support: None, logits: None, confidence: None },
-                // Not reached: a scene is read where a model is among the predictors.
-                (Says::Model(_), None) => continue,
+                Says::Always(classes, _) => Prediction { classes, support: None, logits: None, confidence: None },
             };
             score.digests.push(digest::bytes(prediction.classes));
             score.scores.push(scorer.score(&truth, &prediction).map_err(said)?);
@@ -332,7 +359,7 @@ impl Worker {
             first.iter().zip(second).for_each(|(&first, &second)| agreement.add(first, second));
             score.agreement = Some(agreement);
         }
-        Ok(Entry { frame: set.id(index).to_owned(), index, score })
+        Ok(Entry { frame: set.id(index).to_owned(), index, truth: truth.digest(), score })
     }
 }
 

@@ -24,7 +24,7 @@ const MAX_COUNT: u64 = 1 << 40;
 
 /// What the first line calls the file, and the layout of the lines.
 const FORMAT: &str = "evaluation";
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 
 /// An open journal. No other process can open it meanwhile.
 #[derive(Debug)]
@@ -56,6 +56,7 @@ pub struct Header {
 struct Line {
     frame: String,
     index: usize,
+    truth: String,
     digests: Vec<String>,
     scores: Vec<LineScore>,
     agreement: Option<Vec<u64>>,
@@ -81,6 +82,8 @@ pub struct Entry {
     pub frame: String,
     /// Its place in the set.
     pub index: usize,
+    /// What it was held against: [`Truth::digest`](super::dataset::Truth::digest).
+    pub truth: u64,
     /// What was found.
     pub score: FrameScore,
 }
@@ -102,10 +105,11 @@ impl Entry {
         let line: Line = serde_json::from_str(line).map_err(|e| Error::format(e.to_string()))?;
         let malformed = || Error::format("counts that no frame of this evaluation has");
         let score = line.score(what.kind(), what.predictors.len()).ok_or_else(malformed)?;
+        let truth = hexadecimal(&line.truth).ok_or_else(malformed)?;
         if line.index >= what.frames {
             return Err(Error::format(format!("frame {}, expected one of {}", line.index, what.frames)));
         }
-        Ok(Self { frame: line.frame, index: line.index, score })
+        Ok(Self { frame: line.frame, index: line.index, truth, score })
     }
 }
 
@@ -122,7 +126,8 @@ impl Header {
             voxcast: String,
             version: u32,
         }
-        let Version { voxcast, version } = serde_json::from_slice(line).map_err(|e| Error::format(e.to_string()))?;
+        let Version { voxcast, version } = serde_json::from_slice(line)
+            .map_err(|e| Error::format(format!("not the first line of a journal of an evaluation: {e}")))?;
         if (voxcast.as_str(), version) != (FORMAT, VERSION) {
             let message = format!("{voxcast:?} of version {version}, expected {FORMAT:?} of version {VERSION}");
             return Err(Error::format(message));
@@ -253,7 +258,8 @@ impl Journal {
             there.check(header).map_err(|e| e.in_file(path))?;
         }
         while let Some(entry) = reader.next_entry()? {
-            found(entry).map_err(|e| reader.at_line(&e))?;
+            // What is wrong with another file is not said of this one.
+            found(entry).map_err(|e| if e.path().is_some() { e } else { reader.at_line(&e) })?;
         }
         if reader.header.is_none() {
             // Nothing of ours: only an empty file, or one whose first line was cut short, may become a journal.
@@ -300,6 +306,7 @@ impl Line {
         Self {
             frame: entry.frame.clone(),
             index: entry.index,
+            truth: format!("{:016x}", entry.truth),
             digests: digests.iter().map(|digest| format!("{digest:016x}")).collect(),
             scores: scores.iter().map(LineScore::of).collect(),
             agreement: agreement.as_ref().map(sparse),
@@ -311,8 +318,7 @@ impl Line {
         if self.scores.len() != predictors || self.agreement.is_some() != (predictors == 2) {
             return None;
         }
-        let hexadecimal = |text: &String| u64::from_str_radix(text, 16).ok().filter(|_| text.len() == 16);
-        let digests = self.digests.iter().map(hexadecimal).collect::<Option<Vec<u64>>>()?;
+        let digests = self.digests.iter().map(|text| hexadecimal(text)).collect::<Option<Vec<u64>>>()?;
         let scores = self.scores.iter().map(|score| score.score(kind)).collect::<Option<Vec<Score>>>()?;
         let agreement = match &self.agreement {
             Some(counts) => Some(dense(kind.classes, counts)?),
@@ -366,6 +372,11 @@ impl LineScore {
             calibration,
         })
     }
+}
+
+/// A digest as lines have them.
+fn hexadecimal(text: &str) -> Option<u64> {
+    u64::from_str_radix(text, 16).ok().filter(|_| text.len() == 16)
 }
 
 /// Place and number of the counts that are not 0.

@@ -41,7 +41,7 @@ impl Summary {
             let none = || Totals::new(header.what.kind(), header.names.len(), frames);
             let totals = merged.get_or_insert_with(none);
             // Beyond the limit a journal may have more frames.
-            while let Some(Entry { frame, index, score }) = reader.next_entry()? {
+            while let Some(Entry { frame, index, score, .. }) = reader.next_entry()? {
                 if index < frames && totals.has(index) {
                     return Err(reader.at_line(&Error::mismatch(format!("frame {frame} is there already"))));
                 }

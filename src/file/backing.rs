@@ -1,10 +1,11 @@
 //! Where the bytes of an open file are: mapped, in the program, or copied to memory that nobody else can change.
 
 use crate::base::error::{Error, ErrorKind, Result};
+use crate::file::regular::open_regular;
 use bytemuck::{Pod, Zeroable};
 use memmap2::Mmap;
 use std::borrow::Cow;
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::Read;
 use std::ops::Deref;
 use std::path::Path;
@@ -39,9 +40,9 @@ impl Deref for Backing {
 }
 
 impl Backing {
-    /// Maps the file at `path`, which nobody may change or cut short from then on.
-    pub(crate) fn map(path: &Path) -> Result<Self> {
-        let (file, _) = open(path)?;
+    /// Maps the file at `path`, which should be `what` and which nobody may change or cut short from then on.
+    pub(crate) fn map(path: &Path, what: &str) -> Result<Self> {
+        let (file, _) = open(path, what)?;
         // SAFETY: the map is read-only, and the doc comment passes on the one rule a type cannot hold: nobody shortens
         // or rewrites the file while it is mapped. `container::write` never does; it renames a new file over the name.
         let map = unsafe { Mmap::map(&file) }.map_err(|e| Error::io(path, "map", &e))?;
@@ -59,9 +60,9 @@ impl Backing {
         }
     }
 
-    /// Copies the file at `path`.
-    pub(crate) fn read(path: &Path) -> Result<Self> {
-        let (mut file, len) = open(path)?;
+    /// Copies the file at `path`, which should be `what`.
+    pub(crate) fn read(path: &Path, what: &str) -> Result<Self> {
+        let (mut file, len) = open(path, what)?;
         Self::fill(len, |bytes| file.read_exact(bytes).map_err(|e| Error::io(path, "read", &e)))
             .map_err(|e| e.in_file(path))
     }
@@ -88,17 +89,11 @@ impl Backing {
     }
 }
 
-/// A regular file that is not empty, and its length.
-fn open(path: &Path) -> Result<(File, u64)> {
-    let failed = |e: std::io::Error| Error::io(path, "open", &e);
-    // Asked before opening: opening a pipe would wait for a writer.
-    if !fs::metadata(path).map_err(failed)?.is_file() {
-        return Err(Error::new(ErrorKind::Io, "cannot open: not a regular file").in_file(path));
-    }
-    let file = File::open(path).map_err(failed)?;
-    let len = file.metadata().map_err(failed)?.len();
+/// A regular file that is not empty, and its length. It should be `what`.
+fn open(path: &Path, what: &str) -> Result<(File, u64)> {
+    let (file, len) = open_regular(path)?;
     if len == 0 {
-        return Err(Error::format("the file is empty, expected safetensors").in_file(path));
+        return Err(Error::format(format!("the file is empty, expected {what}")).in_file(path));
     }
     Ok((file, len))
 }
@@ -106,6 +101,7 @@ fn open(path: &Path) -> Result<(File, u64)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs;
 
     #[test]
     fn bytes_of_any_alignment_start_at_an_element() {
@@ -128,7 +124,7 @@ mod tests {
         let path = directory.path().join("file");
         let bytes: Vec<u8> = (0..100_000).map(|i| (i / 7) as u8).collect();
         fs::write(&path, &bytes).unwrap();
-        let mapped = Backing::map(&path).unwrap();
+        let mapped = Backing::map(&path, "bytes").unwrap();
         for _ in 0..2 {
             assert_eq!(mapped[..], bytes);
             mapped.release();
@@ -142,7 +138,7 @@ mod tests {
         let path = directory.path().join("file");
         let bytes: Vec<u8> = (0..1000).map(|i| i as u8).collect();
         fs::write(&path, &bytes).unwrap();
-        let (mapped, copied) = (Backing::map(&path).unwrap(), Backing::read(&path).unwrap());
+        let (mapped, copied) = (Backing::map(&path, "bytes").unwrap(), Backing::read(&path, "bytes").unwrap());
         assert_eq!((&mapped[..], &copied[..]), (&bytes[..], &bytes[..]));
         assert!(copied.as_ptr().addr().is_multiple_of(ALIGNMENT));
         drop(mapped);

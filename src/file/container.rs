@@ -232,7 +232,7 @@ impl Container {
     /// [`ErrorKind::Io`] if it cannot be opened or is no regular file, else as [`Container::from_bytes`]; each names
     /// the file.
     pub fn open(path: &Path) -> Result<Self> {
-        let container = Self::new(Backing::map(path)?).map_err(|e| e.in_file(path))?;
+        let container = Self::new(Backing::map(path, "safetensors")?).map_err(|e| e.in_file(path))?;
         container.bytes.release();
         Ok(container)
     }
@@ -242,7 +242,7 @@ impl Container {
     /// # Errors
     /// As [`Container::open`]; [`ErrorKind::TooLarge`] if the system has no memory for it.
     pub fn read(path: &Path) -> Result<Self> {
-        Self::new(Backing::read(path)?).map_err(|e| e.in_file(path))
+        Self::new(Backing::read(path, "safetensors")?).map_err(|e| e.in_file(path))
     }
 
     /// Checks bytes that are in memory already, such as a file built into the program.

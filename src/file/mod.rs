@@ -9,4 +9,5 @@ pub mod labels;
 pub mod npz;
 #[cfg(any(feature = "eval", feature = "import"))]
 pub(crate) mod pickle;
+pub(crate) mod regular;
 pub(crate) mod replace;

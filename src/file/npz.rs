@@ -5,9 +5,9 @@
 //! take longer than the disk). Equal arrays give equal files: entries carry no time.
 
 use crate::base::error::{Error, ErrorKind, Result};
+use crate::file::regular::open_regular;
 use crate::file::replace::replace_file;
 use std::collections::BTreeSet;
-use std::fs::File;
 use std::io::{self, BufReader, Read, Seek, Write};
 use std::path::Path;
 use zip::write::SimpleFileOptions;
@@ -193,8 +193,7 @@ fn npy_header(descr: &str, shape: &[usize]) -> Vec<u8> {
 /// the shape and the length of an array disagree, a checksum fails, or an entry claims more than its compressed size can
 /// hold.
 pub fn read_npz(path: &Path) -> Result<Vec<OwnedArray>> {
-    let file = File::open(path).map_err(|e| Error::io(path, "open", &e))?;
-    let length = file.metadata().map_err(|e| Error::io(path, "read", &e))?.len();
+    let (file, length) = open_regular(path)?;
     read_from(BufReader::new(file), length).map_err(|e| e.in_file(path))
 }
 
@@ -277,8 +276,7 @@ impl RawArray {
 #[cfg(feature = "eval")]
 pub(crate) fn read_npz_raw(path: &Path, names: &[&str]) -> Result<Vec<RawArray>> {
     let read = || {
-        let file = File::open(path).map_err(|e| Error::io(path, "open", &e))?;
-        let length = file.metadata().map_err(|e| Error::io(path, "read", &e))?.len();
+        let (file, length) = open_regular(path)?;
         let mut arrays = Vec::new();
         each_entry(BufReader::new(file), length, |name, entry, size| {
             if !names.contains(&name) {
@@ -389,8 +387,7 @@ fn unreadable(e: io::Error) -> Error {
 /// disagree, or an element exceeds an `i64`; [`ErrorKind::Unsupported`] for elements that are no such integers and for
 /// Fortran order.
 pub fn read_npy_integers(path: &Path) -> Result<(Vec<usize>, Vec<i64>)> {
-    let file = File::open(path).map_err(|e| Error::io(path, "open", &e))?;
-    let length = file.metadata().map_err(|e| Error::io(path, "read", &e))?.len();
+    let (file, length) = open_regular(path)?;
     read_integers(&mut BufReader::new(file), length).map_err(|e| e.in_file(path))
 }
 

@@ -64,6 +64,9 @@ fn decode(bytes: &[u8], size: Option<[usize; 2]>, notes: &mut Vec<String>) -> Re
         [0xff, 0xd8, 0xff, ..] => decode_jpeg,
         [0x89, b'P', b'N', b'G', ..] => decode_png,
         _ => {
+            if bytes.is_empty() {
+                return Err(Error::format("the file is empty, expected a JPEG or a PNG"));
+            }
             let head = &bytes[..bytes.len().min(8)];
             return Err(Error::format(format!("begins with bytes {head:02x?}, expected a JPEG or a PNG")));
         }

@@ -166,7 +166,9 @@ impl Replay {
     /// lidar, and for a log in which no frame can be run; [`ErrorKind::Unsupported`] for other compressions and lenses;
     /// [`ErrorKind::TooLarge`] beyond four million messages or a chunk beyond 1 GiB. What is cut off at the end is no error.
     pub fn open(path: &Path, network: &Network, options: &ReplayOptions) -> Result<Self> {
-        Backing::map(path).and_then(|bytes| Self::read(bytes, network, options)).map_err(|e| e.in_file(path))
+        Backing::map(path, "an MCAP file")
+            .and_then(|bytes| Self::read(bytes, network, options))
+            .map_err(|e| e.in_file(path))
     }
 
     /// Reads the log that is in memory, as [`Replay::open`] does.

@@ -87,8 +87,10 @@ impl Scene {
     }
 
     fn read_safetensors(bytes: &[u8], notes: &mut Vec<Note>) -> Result<Self> {
-        let file =
-            SafeTensors::deserialize(bytes).map_err(|e| Error::format(format!("not a safetensors file: {e}")))?;
+        let file = SafeTensors::deserialize(bytes).map_err(|e| {
+            let expected = "a scene: a directory with calibration.json, or a .safetensors file";
+            Error::format(format!("not a safetensors file ({e}), expected {expected}"))
+        })?;
         let tensor = |name: &str, dtype: Dtype, expected: &str| {
             let tensor =
                 file.tensor(name).map_err(|_| Error::format(format!("no tensor \"{name}\", expected {expected}")))?;

@@ -46,3 +46,23 @@ fn a_drive_is_run_with_one_session() {
     refused("drive/001/calibration.json", &[&run[..], &["--animation", &film]].concat());
     assert!(fs::read(&film).unwrap() == bytes, "the old animation stays");
 }
+
+#[test]
+fn a_set_is_completed_with_what_it_was_begun_with() {
+    let place = Place::ready();
+    let street = Network { bounds: [[-20.0, 20.0], [-20.0, 20.0], [-5.3, 2.7]], ..network() };
+    fs::write(place.path("street.json"), street.to_json()).unwrap();
+    let [network, set] = ["street.json", "set"].map(|f| place.text(f));
+    let synth = |count: &'static str| ["synth", "--network", &network, "--seed", "5", "--set", &set, "--count", count];
+    done(&synth("1"));
+    let frame = fs::read(place.path("set/000000005.safetensors")).unwrap();
+    let line = refused("000000005.safetensors", &[&synth("2")[..], &["--pixels"]].concat());
+    assert!(line.contains("drawn without --pixels"), "{line}");
+    assert_eq!(done(&synth("2")).trim_end(), format!("2 frames in {set}"));
+    assert!(fs::read(place.path("set/000000005.safetensors")).unwrap() == frame);
+    // The other way round there is only more than what was asked for.
+    fs::remove_dir_all(place.path("set")).unwrap();
+    done(&[&synth("1")[..], &["--pixels"]].concat());
+    done(&[&synth("2")[..], &["--pixels"]].concat());
+    done(&synth("2"));
+}

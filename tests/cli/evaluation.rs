@@ -107,6 +107,9 @@ fn published_sets_are_scored() {
     assert!(line.contains("axes of the ego vehicle"), "{line}");
     fs::remove_file(place.path("gts/scene-0103/a/labels.npz")).unwrap();
     refused("gts/scene-0103/a/labels.npz", &["eval", "--model", &model, "--data", &occ3d]);
+    // Ranges are those of images.
+    let ranges = voxcast(&["calibrate", &model, &occ3d, "-o", &place.text("ranges.json")]);
+    assert!(text(&ranges.stdout).contains("measured on 1 frames"), "{ranges:?}");
 
     let kitti = place.path("kitti/sequences/08");
     fs::create_dir_all(kitti.join("voxels")).unwrap();
@@ -148,19 +151,31 @@ fn an_evaluation_that_was_stopped_goes_on() {
     assert_eq!(done(&resumed), at_once);
     assert!(fs::read(&json).unwrap() == whole, "the same numbers to the last bit");
     assert_eq!(fs::read_to_string(&journal).unwrap().lines().count(), 5);
-    // All is known: nothing is computed again, and the set's images are not needed.
+    // All is known, and nothing is computed again, but the labels must be those of then.
     let frame = place.path("set/000000007.safetensors");
     let kept = fs::read(&frame).unwrap();
+    fs::copy(place.path("set/000000006.safetensors"), &frame).unwrap();
+    let changed = refused("scores.jsonl", &resumed);
+    assert!(changed.contains("frame 000000007 was scored against other labels than the set has now"), "{changed}");
     fs::write(&frame, "damaged").unwrap();
-    assert_eq!(done(&resumed), at_once);
+    let damaged = refused("000000007.safetensors", &resumed);
+    assert!(!damaged.contains("scores.jsonl"), "{damaged}");
+    // Frames beyond the limit are not looked at.
+    done(&[&resumed[..], &["--limit", "2"]].concat());
     fs::write(&frame, kept).unwrap();
+    assert_eq!(done(&resumed), at_once);
+    let old = fs::read_to_string(&journal).unwrap().replacen("\"version\":4", "\"version\":3", 1);
+    fs::write(place.path("old.jsonl"), old).unwrap();
+    let old = refused("old.jsonl", &[&base[..], &["--resume", &place.text("old.jsonl")]].concat());
+    assert!(old.contains("of version 3, expected \"evaluation\" of version 4"), "{old}");
     let line = refused("scores.jsonl", &["eval", "--model", &model, "--data", &data, "--resume", &journal]);
     assert!(line.contains("another evaluation"), "{line}");
     let line = refused("scores.jsonl", &[&resumed[..8], &["--json", &journal]].concat());
     assert!(line.contains("--resume and --json name the same file"), "{line}");
     assert_eq!(fs::read_to_string(&journal).unwrap().lines().count(), 5);
     fs::write(place.path("notes"), "my notes\n").unwrap();
-    refused("notes", &["eval", "--model", &model, "--data", &data, "--resume", &place.text("notes")]);
+    let notes = refused("notes", &["eval", "--model", &model, "--data", &data, "--resume", &place.text("notes")]);
+    assert!(notes.contains("line 1: not the first line of a journal"), "{notes}");
     assert_eq!(fs::read_to_string(place.path("notes")).unwrap(), "my notes\n");
 }
 

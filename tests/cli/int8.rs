@@ -161,7 +161,9 @@ fn what_cannot_become_int8_is_one_line() {
     // A model of int8 is no source of weights, has no unfolded graph, and is not calibrated.
     let int8 = place.text("int8");
     import_int8(&place, "int8", &["--no-self-test"]);
-    assert!(refused("int8", &["import", &int8, "--precision", "f16", "-o", &other]).contains("a model of int8"));
+    for precision in [&[][..], &["--precision", "f16"]] {
+        assert!(refused("int8", &[&["import", &int8, "-o", &other], precision].concat()).contains("a model of int8"));
+    }
     assert!(refused("int8", &["calibrate", &int8, &scene, "-o", &other]).contains("a model of int8"));
     assert!(
         refused("int8", &["profile", "--model", &int8, "--unfolded", &scene]).contains("without the projection fold")

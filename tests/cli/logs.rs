@@ -63,5 +63,14 @@ fn what_cannot_be_run_is_said() {
     let bad = place.text("bad.mcap");
     assert!(refused("bad.mcap", &["run", "--model", &model, &bad, "-o", &out]).contains("expected an MCAP file"));
     fs::write(&bad, "").unwrap();
-    refused("bad.mcap", &["run", "--model", &model, &bad, "-o", &out]);
+    let empty = refused("bad.mcap", &["run", "--model", &model, &bad, "-o", &out]);
+    assert!(empty.contains("the file is empty, expected an MCAP file"), "{empty}");
+    // A log may hold more than what is read of it, and is not replaced by its results.
+    let before = fs::read(&log).unwrap();
+    let itself = refused("out.mcap", &["run", "--model", &model, &log, "-o", &log]);
+    assert!(itself.contains("SCENE and --output name the same file") && fs::read(&log).unwrap() == before, "{itself}");
+    let one = place.text("one.npz");
+    assert!(refused("one.npz", &["run", "--model", &model, &log, "-o", &one]).contains("one file for many frames"));
+    assert!(!place.path("one.npz").exists());
+    refused("scene", &["run", "--model", &model, &scene, "-o", &out, "--tolerance", "50"]);
 }

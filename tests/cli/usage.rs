@@ -75,6 +75,35 @@ fn files_that_are_not_there() {
     assert!(!place.path("out.npz").exists());
 
     // Directories where files belong, and the other way round.
+    for arguments in [
+        &["inspect", &scene][..],
+        &["view", &scene],
+        &["import", &scene, "--network", &net, "-o", &out],
+        &["selftest", &scene],
+    ] {
+        assert!(refused(&scene, arguments).contains("cannot open: not a regular file"), "{arguments:?}");
+    }
+    let drawn = place.text("drawn");
+    fs::create_dir(place.path("drawn")).unwrap();
+    fs::rename(place.path("scene"), place.path("drawn/a")).unwrap();
+    for (output, expected) in [(&model, "a file is there, expected a directory"), (&out, "one file for many frames")] {
+        let line = refused(output, &["run", "--model", &model, &drawn, "-o", output]);
+        assert!(line.contains(expected), "{line}");
+    }
+    fs::rename(place.path("drawn/a"), place.path("scene")).unwrap();
+    for arguments in [
+        &["synth", "-o", &model][..],
+        &["synth", "--frames", "2", "-o", &model],
+        &["synth", "--count", "1", "--set", &model],
+        &["demo", "-o", &model],
+        &["run", "--model", &model, &scene, "-o", &out, "--dump", &model],
+    ] {
+        assert!(refused(&model, arguments).contains("a file is there, expected a directory"), "{arguments:?}");
+    }
+    // What is no scene, and may be taken for one.
+    let calibration = place.text("scene/calibration.json");
+    let line = refused(&calibration, &["run", "--model", &model, &calibration, "-o", &out]);
+    assert!(line.contains("expected a scene: a directory with calibration.json, or a .safetensors file"), "{line}");
     refused(&scene, &["inspect", &scene]);
     refused(&scene, &["import", &scene, "--network", &net, "-o", &out]);
     refused(&scene, &["import", &weights, "--network", &scene, "-o", &out]);
@@ -98,6 +127,90 @@ fn files_that_are_not_there() {
     let image = image.filter(|p| p.extension().is_some_and(|e| e == "png")).min().unwrap();
     fs::remove_file(&image).unwrap();
     refused(image.to_str().unwrap(), &["run", "--model", &model, "--rig", &rig, &scene, "-o", &out]);
+}
+
+#[test]
+fn outputs_in_the_place_of_another_or_of_an_input() {
+    let place = Place::ready();
+    let [net, weights, model, rig, scene, out] =
+        ["network.json", "weights.pth", "model", "rig", "scene", "out.npz"].map(|f| place.text(f));
+    let run = ["run", "--model", &model, &scene, "-o"];
+    done(&[&run[..], &[&out]].concat());
+    let [labels, tensors] = ["labels.npz", "scene.safetensors"].map(|f| place.text(f));
+    fs::copy(&out, &labels).unwrap();
+    fs::copy(place.path("weights.pth"), place.path("scene.safetensors")).unwrap();
+    // A path need not be spelt the same.
+    let model_again = place.text("scene/../model");
+    for (names, file, arguments) in [
+        ("--model and --output", "model", &[&run[..], &[&model_again]].concat()[..]),
+        ("--rig and --output", "rig", &["run", "--model", &model, "--rig", &rig, &scene, "-o", &rig]),
+        ("SCENE and --output", "scene.safetensors", &["run", "--model", &model, &tensors, "-o", &tensors]),
+        ("--output and --png", "out.npz", &[&run[..], &[&out, "--png", &out]].concat()),
+        (
+            "--png and --html",
+            "new",
+            &[&run[..], &[&out, "--png", &place.text("new"), "--html", &place.text("new")]].concat(),
+        ),
+        ("CHECKPOINT and --output", "weights.pth", &["import", &weights, "--network", &net, "-o", &weights]),
+        ("--model and --output", "model", &["rig", &scene, "--model", &model, "-o", &model]),
+        (
+            "SCENE and --output",
+            "calibration.json",
+            &[
+                "rig",
+                &place.text("scene/calibration.json"),
+                "--model",
+                &model,
+                "-o",
+                &place.text("scene/calibration.json"),
+            ],
+        ),
+        ("OUT.npz and --output", "out.npz", &["view", &out, "-o", &out]),
+        ("--truth and --output", "labels.npz", &["view", &out, "--truth", &labels, "-o", &labels]),
+        ("MODEL and --output", "model", &["calibrate", &model, &scene, "-o", &model]),
+        ("--model and --trace", "model", &["profile", "--model", &model, &scene, "--trace", &model]),
+        ("--model and --json", "model", &["eval", "--model", &model, "--data", "synthetic:none", "--json", &model]),
+    ] {
+        let before = fs::read(place.path(file)).ok();
+        let line = refused(file, arguments);
+        assert!(line.contains(&format!("{names} name the same file")), "{line}");
+        assert!(fs::read(place.path(file)).ok() == before, "{arguments:?}");
+    }
+}
+
+/// Commands that print line by line, at once, and a table.
+fn printing(place: &Place) -> [Vec<String>; 3] {
+    let [model, scene, out] = ["model", "scene", "out.npz"].map(|f| place.text(f));
+    [
+        vec!["inspect", &model, "--operations", "--plan"],
+        vec!["run", "--model", &model, &scene, "-o", &out],
+        vec!["compare", &out, &out],
+    ]
+    .map(|arguments| arguments.into_iter().map(str::to_owned).collect())
+}
+
+#[test]
+#[cfg(unix)]
+fn a_reader_that_has_gone_is_no_fault() {
+    let place = Place::ready();
+    for arguments in printing(&place) {
+        let (reader, writer) = std::io::pipe().unwrap();
+        drop(reader);
+        let output = Command::new(env!("CARGO_BIN_EXE_voxcast")).args(&arguments).stdout(writer).output().unwrap();
+        assert_eq!((output.status.code(), text(&output.stderr)), (Some(0), String::new()), "{arguments:?}");
+    }
+    assert!(place.path("out.npz").exists(), "the work is done all the same");
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn an_output_that_takes_nothing_is_said() {
+    let place = Place::ready();
+    for arguments in printing(&place) {
+        let full = fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+        let output = Command::new(env!("CARGO_BIN_EXE_voxcast")).args(&arguments).stdout(full).output().unwrap();
+        assert_refused(&output, "standard output: cannot write", &format!("{arguments:?}"));
+    }
 }
 
 #[test]

@@ -6,7 +6,8 @@ Not part of the test suite: it needs some gigabytes of packages and an idle mach
     cargo build --release && python tests/peers/speed.py target/release/voxcast
 
 The network is `nuscenes-200` without deformable stages (PyTorch has no such operator), weights drawn, images of 256 x 704 unless
-asked otherwise. The modules of `train/` are exported to ONNX in two halves: backbone and pyramid of one camera, and everything
+asked otherwise. With `--deformable` stages 3 and 4 are deformable as published, and the peer is ONNX Runtime with its operator
+`DeformConv`. The modules of `train/` are exported to ONNX in two halves: backbone and pyramid of one camera, and everything
 after the gather. OpenVINO's int8 is quantised by NNCF, with window attention left in floating point, as here. Every candidate runs
 with two threads in a process of its own; rounds go through all candidates in turn. The table (Markdown, on standard output)
 has medians over the rounds of each process's median, in seconds. `--int8` compares int8 with int8.
@@ -37,6 +38,40 @@ NETWORK = {
 }
 
 
+def deform(backbone, stages: list[bool]) -> None:
+    """Makes the 3x3 convolutions of `stages` deformable, in place: DCNv2, exported as ONNX's DeformConv. They cannot run."""
+    import torch
+    from torch import nn
+
+    class Operator(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, x, weight, offsets, bias, mask):
+            return torch.zeros_like(x)
+
+        @staticmethod
+        def symbolic(g, x, weight, offsets, bias, mask):
+            attributes = {"kernel_shape_i": [3, 3], "pads_i": [1, 1, 1, 1], "strides_i": [1, 1]}
+            return g.op("DeformConv", x, weight, offsets, bias, mask, **attributes).setType(x.type())
+
+    class Deformable(nn.Module):
+        def __init__(self, plain: nn.Conv2d) -> None:
+            super().__init__()
+            self.weight = plain.weight
+            self.conv_offset = nn.Conv2d(plain.in_channels, 27, 3, 1, 1)
+            # Offsets of a fraction of a pixel, as trained ones are.
+            nn.init.normal_(self.conv_offset.weight, std=1e-3)
+            nn.init.zeros_(self.conv_offset.bias)
+            self.register_buffer("bias", torch.zeros(plain.out_channels), persistent=False)
+
+        def forward(self, x):
+            first, second, mask = torch.chunk(self.conv_offset(x), 3, 1)
+            return Operator.apply(x, self.weight, torch.cat((first, second), 1), self.bias, mask.sigmoid())
+
+    for layer, deformed in enumerate(stages, 1):
+        for block in getattr(backbone, f"layer{layer}") if deformed else []:
+            block.conv2 = Deformable(block.conv2)
+
+
 def export(directory: Path) -> None:
     """Writes checkpoint.safetensors and the halves as ONNX."""
     import torch
@@ -46,7 +81,9 @@ def export(directory: Path) -> None:
     sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "train"))
     from voxcast_train.network import Bottleneck, InverseMatrixVT3D, Network, initialise
 
-    network = Network.load(directory / "network.json")
+    wanted = json.loads((directory / "network.json").read_text())
+    (directory / "plain.json").write_text(json.dumps(wanted | {"dcn": [False] * 4}))
+    network = Network.load(directory / "plain.json")
     torch.manual_seed(1)
     model = InverseMatrixVT3D(network).eval()
     initialise(model)
@@ -56,6 +93,7 @@ def export(directory: Path) -> None:
         for block in model.img_backbone.modules():
             if isinstance(block, Bottleneck):
                 block.bn3.weight.fill_(0.2)
+    deform(model.img_backbone, wanted["dcn"])
     state = model.state_dict()
     state = {name: value.contiguous() for name, value in state.items() if not name.endswith("num_batches_tracked")}
     save_file(state, directory / "checkpoint.safetensors")
@@ -174,13 +212,13 @@ def time_voxcast(program: str, directory: Path) -> dict[str, float]:
     return {"image": image / cameras, "volume": sum(rows.values()) - image - gather}
 
 
-def prepare(program: str, directory: Path, size: list[int], int8: bool) -> None:
+def prepare(program: str, directory: Path, size: list[int], int8: bool, deformable: bool) -> None:
     """Writes everything that candidates read."""
 
     def run(*command):
         subprocess.run(command, cwd=directory, check=True, stdout=sys.stderr)
 
-    (directory / "network.json").write_text(json.dumps(NETWORK | {"image": size}))
+    (directory / "network.json").write_text(json.dumps(NETWORK | {"image": size, "dcn": [False, False, deformable, deformable]}))
     export(directory)
     run(program, "synth", "--network", "network.json", "--seed", "7", "-o", "scene")
     precision = ["--precision", "int8", "--calibrate", "scene"] if int8 else []
@@ -188,6 +226,7 @@ def prepare(program: str, directory: Path, size: list[int], int8: bool) -> None:
     run(program, "rig", "scene", "--model", "model.safetensors", "-o", "rig.safetensors")
     if int8:
         quantise(directory)
+    if int8 or deformable:
         return
     import MNN  # noqa: F401, first
     import _tools
@@ -198,9 +237,8 @@ def prepare(program: str, directory: Path, size: list[int], int8: bool) -> None:
         _tools.mnnconvert(["mnnconvert", "-f", "ONNX", *files, "--bizCode", "speed"])
 
 
-def measure(program: str, directory: Path, rounds: int, int8: bool) -> None:
-    """Takes turns and prints the table."""
-    peers = {"OpenVINO": ".int8.xml"} if int8 else {"ONNX Runtime": ".onnx", "OpenVINO": ".onnx", "MNN": ".onnx"}
+def measure(program: str, directory: Path, rounds: int, peers: dict[str, str]) -> None:
+    """Takes turns with `peers`, of each of which the ending of its files is given, and prints the table."""
     seconds: dict[tuple[str, str], list[float]] = {}
     for turn in range(rounds):
         print(f"round {turn + 1} of {rounds}", file=sys.stderr)
@@ -226,12 +264,19 @@ def main() -> None:
     parser.add_argument("program", help="the voxcast program, built for release")
     parser.add_argument("--image", default="256x704", help="height x width of the images, multiples of 32")
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--int8", action="store_true", help="compare int8 with int8")
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument("--int8", action="store_true", help="compare int8 with int8")
+    kind.add_argument("--deformable", action="store_true", help="with deformable stages 3 and 4, which ONNX Runtime has too")
     options = parser.parse_args()
+    peers = {"ONNX Runtime": ".onnx", "OpenVINO": ".onnx", "MNN": ".onnx"}
+    if options.int8:
+        peers = {"OpenVINO": ".int8.xml"}
+    elif options.deformable:
+        peers = {"ONNX Runtime": ".onnx"}
     with tempfile.TemporaryDirectory() as temporary:
         directory, program = Path(temporary), str(Path(options.program).resolve())
-        prepare(program, directory, [int(v) for v in options.image.split("x")], options.int8)
-        measure(program, directory, options.rounds, options.int8)
+        prepare(program, directory, [int(v) for v in options.image.split("x")], options.int8, options.deformable)
+        measure(program, directory, options.rounds, peers)
 
 
 if __name__ == "__main__":

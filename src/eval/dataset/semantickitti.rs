@@ -8,10 +8,10 @@ use super::kitti::{GRID, check_pose, numbers, product, rows};
 use super::{DataSet, Grid, IGNORED, Truth};
 use crate::base::error::{Error, Result};
 use crate::base::note::Note;
+use crate::file::regular::open_regular;
 use crate::image::file::read_image;
 use crate::scene::matrix::check_intrinsic;
 use crate::scene::{Scene, check_finite};
-use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -216,8 +216,7 @@ impl SemanticKitti {
 
 /// The bytes of a file that has `expected` of them.
 fn read_exactly(path: &Path, expected: usize) -> Result<Vec<u8>> {
-    let file = File::open(path).map_err(|e| Error::io(path, "open", &e))?;
-    let length = file.metadata().map_err(|e| Error::io(path, "read", &e))?.len();
+    let (file, length) = open_regular(path)?;
     if length != expected as u64 {
         return Err(Error::format(format!("{length} bytes, expected {expected}")).in_file(path));
     }

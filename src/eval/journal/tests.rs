@@ -22,7 +22,12 @@ fn subject(data: &str, predictors: usize) -> Subject {
 }
 
 fn entry(seed: u8, predictors: usize) -> Entry {
-    Entry { frame: format!("frame \"{seed}\""), index: usize::from(seed), score: frame(seed, predictors) }
+    Entry {
+        frame: format!("frame \"{seed}\""),
+        index: usize::from(seed),
+        truth: u64::MAX / 3 - u64::from(seed),
+        score: frame(seed, predictors),
+    }
 }
 
 fn frame(seed: u8, predictors: usize) -> FrameScore {
@@ -111,10 +116,11 @@ fn what_does_not_belong_is_refused_and_left_alone() {
         ("fffffffe\"]", "fffffffe\",\"0\"]", "line 2: counts"),
         ("[511,1]", "[512,1]", "line 2: counts"),
         ("\"calibration\":[[", "\"calibration\":[[[],[]],[", "line 2: counts"),
+        ("\"truth\":\"", "\"truth\":\"0", "line 2: counts"),
         ("\"losses\":[", "\"loses\":[", "line 2: "),
         ("\"index\":1", "\"index\":2", "line 2: frame 2 is not of shard 1/2"),
         ("\"index\":1", "\"index\":9", "line 2: frame 9, expected one of 9"),
-        ("\"version\":3", "\"version\":1", "of version 1, expected"),
+        ("\"version\":4", "\"version\":1", "of version 1, expected"),
         ("[\"a name\"]", "[]", "line 1: 0 names"),
         ("\"shard\":[1,2]", "\"shard\":[2,2]", "line 1: shard 2/2"),
     ] {

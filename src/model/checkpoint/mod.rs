@@ -30,9 +30,9 @@ pub use tensor::{Dtype, TensorView};
 
 use crate::base::error::{Error, Result};
 use crate::base::note::Note;
+use crate::file::regular::open_regular;
 use archive::Storage;
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use tensor::Tensor;
@@ -85,16 +85,14 @@ impl Checkpoint {
     /// [`ErrorKind::Io`](crate::ErrorKind::Io) where the file cannot be opened or mapped, else as [`Checkpoint::from_bytes`].
     pub fn open(path: impl AsRef<Path>) -> Result<Self> {
         let path = path.as_ref();
-        let io = |doing| move |e: std::io::Error| Error::io(path, doing, &e);
-        let file = File::open(path).map_err(io("open"))?;
-        let meta = file.metadata().map_err(io("open"))?;
-        if meta.is_file() && meta.len() == 0 {
+        let (file, length) = open_regular(path)?;
+        if length == 0 {
             return Err(Error::format("the file is empty, expected a .pth or .safetensors checkpoint").in_file(path));
         }
         // SAFETY: the mapping is private and read-only, and it is only ever read as plain bytes, each value of which is
         // valid. That nobody shortens or rewrites the file meanwhile is the caller's part, stated above; no map can
         // enforce it.
-        let map = unsafe { memmap2::Mmap::map(&file) }.map_err(io("map"))?;
+        let map = unsafe { memmap2::Mmap::map(&file) }.map_err(|e| Error::io(path, "map", &e))?;
         let checkpoint = Self::new(Bytes::Mapped(map)).map_err(|e| e.in_file(path))?;
         Ok(Self { path: Some(path.to_owned()), ..checkpoint })
     }
