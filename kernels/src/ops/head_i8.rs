@@ -190,10 +190,12 @@ impl Kernel for Run<'_> {
         self.blocks(
             #[inline(always)]
             |first, count, Room { a, b, sums, product }| {
-                let source = Rows { data: &input[first * channels..], stride: channels };
-                layers[0].to::<Narrow>().compute(s, &source, &hidden, 0..count, a, product);
-                let source = Rows { data: a, stride: channels };
-                layers[1].to::<Narrow>().compute(s, &source, &hidden, 0..count, b, product);
+                // A loop, so that the product is compiled once for both layers.
+                for layer in 0..2 {
+                    let (data, to) = if layer == 0 { (&input[first * channels..], &mut **a) } else { (&**a, &mut **b) };
+                    let source = Rows { data, stride: channels };
+                    layers[layer].to::<Narrow>().compute(s, &source, &hidden, 0..count, to, product);
+                }
                 let (source, target) = (Rows { data: b, stride: channels }, Linear { first: 0, stride: classes });
                 layers[2].to::<Raw>().compute(s, &source, &target, 0..count, sums, product);
             },
