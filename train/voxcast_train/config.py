@@ -48,16 +48,31 @@ class Jitter:
 
 @dataclass(frozen=True)
 class Tail:
-    """Training of the last stage alone, after the run, on frames of its own (`tail.py`)."""
+    """Training of the end of a network alone, after the run, on frames of its own (`tail.py`)."""
 
     first: int = 20_000
     count: int = 160
     """Seeds of its frames."""
     steps: int = 400
+    minutes: float | None = None
+    """Time to train for, instead of steps."""
     batch: int = 4
     learning_rate: float = 1e-3
     masked: float = 0.2
     lovasz_voxels: int = 60_000
+    volumes: bool = False
+    """Train everything behind the gather, not the last stage alone."""
+    jitter: Jitter | None = None
+    """Other rigs that its frames are drawn for, the first ones of its seeds: so many for each, which together are the share."""
+
+    def seeds_of(self, rig: int) -> Seeds:
+        """The frames of a rig, by number; 0 is the plain one, whose seeds come last."""
+        if self.jitter is None:
+            return Seeds(self.first, self.count)
+        each = round(self.count * self.jitter.share / self.jitter.rigs)
+        if rig > 0:
+            return Seeds(self.first + (rig - 1) * each, each)
+        return Seeds(self.first + self.jitter.rigs * each, self.count - self.jitter.rigs * each)
 
 
 @dataclass(frozen=True)
@@ -131,7 +146,8 @@ class Config:
             if values.get("jitter") is not None:
                 values["jitter"] = Jitter(**values["jitter"])
             if values.get("tail") is not None:
-                values["tail"] = Tail(**values["tail"])
+                jitter = values["tail"].get("jitter")
+                values["tail"] = Tail(**{**values["tail"], "jitter": None if jitter is None else Jitter(**jitter)})
             if "phases" in values:
                 values["phases"] = tuple(Phase(**phase) for phase in values["phases"])
             config = Config(**sets, **values, directory=path.parent)
