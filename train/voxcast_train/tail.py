@@ -48,8 +48,9 @@ def inputs_of(model: InverseMatrixVT3D, rig: Rig, frames: Frames, tail: Tail, de
     for number in range(len(frames)):
         images = frames.batch([number])["images"].to(device)
         kept = kept_cameras(1, model.network.cameras, tail.masked, device) if tail.masked > 0 else None
-        gathered = view.gather(model.pyramid(images), rig, 1, kept)
-        row = torch.cat([mean for means in gathered for mean in means], 1) if tail.volumes else view.coarse(gathered)[0]
+        with torch.autocast(device.type, torch.bfloat16, enabled=tail.precision == "bf16"):
+            gathered = view.gather(model.pyramid(images), rig, 1, kept)
+            row = torch.cat([mean for means in gathered for mean in means], 1) if tail.volumes else view.coarse(gathered)[0]
         if number == 0:
             rows = torch.empty((len(frames), *row.shape[1:]), dtype=torch.float16, device=device)
         rows[number] = row[0]
@@ -83,7 +84,9 @@ def train_tail(model: InverseMatrixVT3D, sets: list, tail: Tail, device: torch.d
     started, shown, step, done = time.monotonic(), [], 0, 0.0
     while done < 1.0:
         numbers = order(seed, len(labels), tail.batch, step)
-        losses = level_losses(logits_of(model, inputs[numbers], tail), labels[numbers].to(device), weights, tail.lovasz_voxels)
+        with torch.autocast(device.type, torch.bfloat16, enabled=tail.precision == "bf16"):
+            logits = logits_of(model, inputs[numbers], tail)
+        losses = level_losses(logits, labels[numbers].to(device), weights, tail.lovasz_voxels)
         total = sum(getattr(PHASE, name) * loss for name, loss in losses.items())
         warm = min(1.0, (step + 1) / 20)
         for group in optimiser.param_groups:
@@ -120,7 +123,9 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, help="time to train for, instead of steps")
     parser.add_argument("--batch", type=int, default=Tail.batch)
     parser.add_argument("--learning-rate", type=float, default=Tail.learning_rate)
+    parser.add_argument("--lovasz-voxels", type=int, default=Tail.lovasz_voxels, help="those that Lovasz-softmax sees of a batch")
     parser.add_argument("--masked", type=float, default=Tail.masked, help="share of the frames that lose a camera")
+    parser.add_argument("--precision", choices=("f32", "bf16"), default=Tail.precision)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
@@ -135,7 +140,8 @@ def main() -> int:
         sets = [Frames([path], network, pixels=False, limit=options.limit) for path in options.set]
         model = load_model(network, options.checkpoint)
         tail = Tail(steps=options.steps, minutes=options.minutes, batch=options.batch, learning_rate=options.learning_rate,
-                    masked=options.masked, volumes=options.volumes)  # fmt: skip
+                    masked=options.masked, lovasz_voxels=options.lovasz_voxels, volumes=options.volumes,
+                    precision=options.precision)  # fmt: skip
         train_tail(model, list(zip(loaded * len(sets) if len(loaded) == 1 else loaded, sets)), tail, device, options.seed)
         export(model.state_dict(), options.output, half=True)
     except (InputError, OSError) as error:
