@@ -485,6 +485,7 @@ class Configs(Place):
             ({"jitter": {"rigs": 1}, "drawn": "beside"}, "degrees"),
             ({"minutes": 3, "workers": 2}, "minutes"),
             ({"tail": {"nonsense": 1}}, "nonsense"),
+            ({"tail": {"precision": "f16"}}, "precision.*f16"),
         ):
             with self.subTest(changes), self.assertRaisesRegex(InputError, message):
                 self.config(**changes)

@@ -21,13 +21,14 @@ from voxcast_train.across import summary  # noqa: E402
 from voxcast_train.config import Config, Tail  # noqa: E402
 from voxcast_train.data import Frames  # noqa: E402
 from voxcast_train.errors import InputError  # noqa: E402
-from voxcast_train.evaluate import evaluate, evaluate_majority, load_model  # noqa: E402
+from voxcast_train.evaluate import covered_by, evaluate, evaluate_majority, evaluate_masked, load_model  # noqa: E402
 from voxcast_train.export import export  # noqa: E402
+from voxcast_train.metrics import Confusion  # noqa: E402
 from voxcast_train.network import InverseMatrixVT3D, Network, initialise  # noqa: E402
 from voxcast_train.program import Program  # noqa: E402
 from voxcast_train.reproduce import reproduce  # noqa: E402
 from voxcast_train.rig import Rig  # noqa: E402
-from voxcast_train.tail import STAGE, train_tail  # noqa: E402
+from voxcast_train.tail import STAGE, VOLUMES, train_tail  # noqa: E402
 from voxcast_train.train import run  # noqa: E402
 from voxcast_train.unpack import restore_norms, unpack  # noqa: E402
 from voxcast_train.workers import Worker, run_workers  # noqa: E402
@@ -289,7 +290,8 @@ class FromSeeds(unittest.TestCase):
 
     def test_frames_are_drawn_beside_and_a_model_comes_out(self):
         first = self.config("first")
-        tail = {"first": 20000, "count": 2, "steps": 2, "batch": 2, "lovasz_voxels": 500}
+        ring = {"rigs": 1, "degrees": 1, "metres": 0.05, "share": 0.5}
+        tail = {"first": 20000, "count": 4, "steps": 2, "batch": 2, "lovasz_voxels": 500, "volumes": True, "jitter": ring}
         config = self.config("second", after="first.json", tail=tail, minutes=0.02, steps=100, phases=[{"start": 0}])
         self.assertNotEqual(first.identity(), config.identity())
         reports = reproduce(config, self.work / "run", self.program, CPU)
@@ -308,26 +310,56 @@ class FromSeeds(unittest.TestCase):
         self.assertNotEqual(reports["without CAM_BACK"]["all"], reports["plain"]["all"])
         self.assertIn("jittered", summary(reports))
         self.assertEqual(list((run_of_first / "drawn").glob("*/*.safetensors")), [], "frames that were read are gone")
+        of_tail = [sorted(path.stem for path in (self.work / "run" / name).glob("*.safetensors")) for name in ("tail", "tail-01/set")]
+        self.assertEqual(of_tail, [["000020002", "000020003"], ["000020000", "000020001"]])
         # The model is one of the network, and its function that of the checkpoint.
         voxcast("selftest", self.work / "run" / "model.safetensors")
 
-    def test_the_last_stage_alone_gets_better_and_nothing_else_changes(self):
+    def test_the_end_alone_gets_better_and_nothing_else_changes(self):
         made_up.write_network(self.work)
         made_up.write_set(self.work / "train", 0, 4)
         voxcast("rig", next((self.work / "train").iterdir()), "--network", self.work / "network.json", "-o", self.work / "rig.safetensors")
         network = Network.load(self.work / "network.json")
         frames, rig = Frames([self.work / "train"], network, pixels=False), Rig.load(self.work / "rig.safetensors", network)
+        new = InverseMatrixVT3D(network)
+        initialise(new)
+        before = {name: tensor.clone() for name, tensor in new.state_dict().items()}
+        first = evaluate(new, rig, frames, CPU).report()["all"]["iou"]
+        kept = ("running_mean", "running_var", "num_batches_tracked", "attention_bias_idxs")
+        for volumes, trained in ((False, STAGE), (True, VOLUMES)):
+            with self.subTest(volumes=volumes):
+                model = InverseMatrixVT3D(network)
+                model.load_state_dict(before)
+                tail = Tail(steps=40, batch=2, learning_rate=1e-2, masked=0.0, volumes=volumes)
+                self.assertEqual(train_tail(model, [(rig, frames)], tail, CPU), 40)
+                self.assertGreater(evaluate(model, rig, frames, CPU).report()["all"]["iou"], first + 10.0)
+                for name, tensor in model.state_dict().items():
+                    # A bias before a batch norm that keeps its statistics has a gradient too.
+                    changes = name.startswith(trained) and not name.endswith(kept)
+                    self.assertEqual(torch.equal(tensor, before[name]), not changes, name)
+
+    def test_one_look_at_the_images_scores_every_mask(self):
+        made_up.write_network(self.work)
+        made_up.write_set(self.work / "set", 0, 2)
+        voxcast("rig", next((self.work / "set").iterdir()), "--network", self.work / "network.json", "-o", self.work / "rig.safetensors")
+        network = Network.load(self.work / "network.json")
+        frames, rig = Frames([self.work / "set"], network, pixels=False), Rig.load(self.work / "rig.safetensors", network)
         model = InverseMatrixVT3D(network)
         initialise(model)
-        before = {name: tensor.clone() for name, tensor in model.state_dict().items()}
-        scores = [evaluate(model, rig, frames, CPU).report()["all"]["iou"]]
-        train_tail(model, rig, frames, Tail(steps=40, batch=2, learning_rate=1e-2, masked=0.0), CPU)
-        scores.append(evaluate(model, rig, frames, CPU).report()["all"]["iou"])
-        self.assertGreater(scores[1], scores[0] + 10.0)
-        for name, tensor in model.state_dict().items():
-            last = name.startswith(STAGE) and not name.endswith(("running_mean", "running_var", "num_batches_tracked"))
-            # A bias before a batch norm that keeps its statistics has a gradient too.
-            self.assertEqual(torch.equal(tensor, before[name]), not last, name)
+        whole, masked = evaluate_masked(model, rig, frames, CPU)
+        self.assertTrue(torch.equal(whole.counts, evaluate(model, rig, frames, CPU).counts))
+        for camera, (without, with_it) in enumerate(masked):
+            others = 1.0 - torch.eye(network.cameras)[camera]
+            alone = Confusion(network)
+            for number in range(len(frames)):
+                batch = frames.batch([number])
+                with torch.no_grad():
+                    predicted = model(batch["images"], rig, kept=others[None])[0][0].argmax(-1)
+                alone.add(predicted, batch["labels"][0][0], (batch["visible"][0] != 0) & covered_by(rig, network, others))
+            self.assertTrue(torch.equal(without.counts, alone.counts), camera)
+            self.assertFalse(torch.equal(without.counts, with_it.counts), camera)
+            self.assertTrue(torch.equal(with_it.counts.sum(1), whole.counts.sum(1)), "every voxel is there, seen or not")
+            self.assertTrue(torch.equal(with_it.counts.sum((1, 3)), without.counts.sum((1, 3))), "of the same voxels")
 
     def test_a_program_that_fails_is_named(self):
         config = self.config("failing", jitter=None)

@@ -17,7 +17,7 @@ import torch
 from . import rigs
 from .data import Frames
 from .errors import InputError
-from .evaluate import evaluate, load_model
+from .evaluate import evaluate, evaluate_masked, load_model
 from .files import replace
 from .metrics import Confusion
 from .network import InverseMatrixVT3D, Network
@@ -40,7 +40,8 @@ def across(model: InverseMatrixVT3D, network_path: Path, work: Path, voxcast: Pr
     rigs.make(work / "plain", names, lidar2img, network, network_path, voxcast)
     plain = load_rig(work / "plain", network, device)
     frames = Frames([work / "held-out"], network, pixels=False, limit=count)
-    reports = {"plain": evaluate(model, plain, frames, device).report()}
+    whole, masked = evaluate_masked(model, plain, frames, device)
+    reports = {"plain": whole.report()}
     confusion = Confusion(network)
     for ring in range(RINGS):
         share = count // RINGS + (ring < count % RINGS)
@@ -53,9 +54,9 @@ def across(model: InverseMatrixVT3D, network_path: Path, work: Path, voxcast: Pr
         of_ring = Frames([directory / "set"], network, pixels=False, limit=share)
         confusion.counts += evaluate(model, load_rig(directory, network, device), of_ring, device).counts
     reports["jittered"] = confusion.report()
-    for camera, name in enumerate(names):
-        reports[f"without {name}"] = evaluate(model, plain, frames, device, masked=camera).report()
-        reports[f"with {name}"] = evaluate(model, plain, frames, device, others_than=camera).report()
+    for name, (without, with_it) in zip(names, masked):
+        reports[f"without {name}"] = without.report()
+        reports[f"with {name}"] = with_it.report()
     return reports
 
 

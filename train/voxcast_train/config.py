@@ -48,16 +48,33 @@ class Jitter:
 
 @dataclass(frozen=True)
 class Tail:
-    """Training of the last stage alone, after the run, on frames of its own (`tail.py`)."""
+    """Training of the end of a network alone, after the run, on frames of its own (`tail.py`)."""
 
     first: int = 20_000
     count: int = 160
     """Seeds of its frames."""
     steps: int = 400
+    minutes: float | None = None
+    """Time to train for, instead of steps."""
     batch: int = 4
     learning_rate: float = 1e-3
     masked: float = 0.2
     lovasz_voxels: int = 60_000
+    volumes: bool = False
+    """Train everything behind the gather, not the last stage alone."""
+    precision: str = "f32"
+    """As of a run; `bf16` here is faster on CPUs with AVX512-BF16 too."""
+    jitter: Jitter | None = None
+    """Other rigs that its frames are drawn for, the first ones of its seeds: so many for each, which together are the share."""
+
+    def seeds_of(self, rig: int) -> Seeds:
+        """The frames of a rig, by number; 0 is the plain one, whose seeds come last."""
+        if self.jitter is None:
+            return Seeds(self.first, self.count)
+        each = round(self.count * self.jitter.share / self.jitter.rigs)
+        if rig > 0:
+            return Seeds(self.first + (rig - 1) * each, each)
+        return Seeds(self.first + self.jitter.rigs * each, self.count - self.jitter.rigs * each)
 
 
 @dataclass(frozen=True)
@@ -131,14 +148,16 @@ class Config:
             if values.get("jitter") is not None:
                 values["jitter"] = Jitter(**values["jitter"])
             if values.get("tail") is not None:
-                values["tail"] = Tail(**values["tail"])
+                jitter = values["tail"].get("jitter")
+                values["tail"] = Tail(**{**values["tail"], "jitter": None if jitter is None else Jitter(**jitter)})
             if "phases" in values:
                 values["phases"] = tuple(Phase(**phase) for phase in values["phases"])
             config = Config(**sets, **values, directory=path.parent)
         except (KeyError, TypeError, json.JSONDecodeError) as error:
             raise InputError(f"{path}: {error}") from error
-        if config.precision not in ("f32", "bf16"):
-            raise InputError(f'{path}: "precision": found {config.precision}, expected f32 or bf16')
+        for precision in {config.precision, "f32" if config.tail is None else config.tail.precision}:
+            if precision not in ("f32", "bf16"):
+                raise InputError(f'{path}: "precision": found {precision}, expected f32 or bf16')
         if config.drawn not in ("before", "beside"):
             raise InputError(f'{path}: "drawn": found {config.drawn}, expected before or beside')
         if config.drawn == "beside" and config.workers != 1:

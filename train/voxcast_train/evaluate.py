@@ -26,29 +26,54 @@ GPU_BATCH = 10
 """Frames that a GPU evaluates at once."""
 
 
+def batches(frames: Frames, device: torch.device):
+    """Numbers of the frames that are evaluated at once."""
+    size = GPU_BATCH if device.type == "cuda" else 1
+    for first in range(0, len(frames), size):
+        yield list(range(first, min(first + size, len(frames))))
+
+
 @torch.no_grad()
-def evaluate(model: InverseMatrixVT3D, rig: Rig, frames: Frames, device: torch.device, precision: str = "f32",
-             masked: int | None = None, others_than: int | None = None) -> Confusion:  # fmt: skip
-    """Runs every frame in evaluation mode and leaves the model in that mode. With a `masked` camera, "seen" are the visible
-    voxels that the others have in their images; with `others_than` too, but then that camera is there."""
+def evaluate(model: InverseMatrixVT3D, rig: Rig, frames: Frames, device: torch.device, precision: str = "f32") -> Confusion:
+    """Runs every frame in evaluation mode and leaves the model in that mode."""
     model.eval()
-    network = model.network
-    confusion = Confusion(network)
-    kept, covered = None, True
-    left_out = others_than if masked is None else masked
-    if left_out is not None:
-        others = (torch.arange(network.cameras, device=device) != left_out).float()
-        covered = covered_by(rig, network, others)
-        kept = None if masked is None else others
-    for first in range(0, len(frames), GPU_BATCH if device.type == "cuda" else 1):
-        numbers = list(range(first, min(first + (GPU_BATCH if device.type == "cuda" else 1), len(frames))))
+    confusion = Confusion(model.network)
+    for numbers in batches(frames, device):
         batch = frames.batch(numbers)
         with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16"):
-            kept_of = None if kept is None else kept.expand(len(numbers), -1)
-            logits = model(batch["images"].to(device), rig, kept=kept_of)[0]
+            logits = model(batch["images"].to(device), rig)[0]
         for number, predicted in enumerate(logits.argmax(-1).cpu()):
-            confusion.add(predicted, batch["labels"][0][number], (batch["visible"][number] != 0) & covered)
+            confusion.add(predicted, batch["labels"][0][number], batch["visible"][number])
     return confusion
+
+
+@torch.no_grad()
+def evaluate_masked(model: InverseMatrixVT3D, rig: Rig, frames: Frames, device: torch.device) -> tuple:
+    """As `evaluate`; and for each camera two confusions, without it and with it, of which "seen" are those visible voxels that the
+    other cameras have in their images. Images go through the image half once."""
+    model.eval()
+    network = model.network
+    whole, masked = Confusion(network), []
+    for camera in range(network.cameras):
+        others = (torch.arange(network.cameras, device=device) != camera).float()
+        masked.append((others, covered_by(rig, network, others), Confusion(network), Confusion(network)))
+    for numbers in batches(frames, device):
+        batch = frames.batch(numbers)
+        pyramid = model.pyramid(batch["images"].to(device))
+
+        def predictions(kept):
+            kept = None if kept is None else kept.expand(len(numbers), -1)
+            return model.occ_head(model.volumes(pyramid, rig, len(numbers), kept), (0,))[0].argmax(-1).cpu()
+
+        of_whole = predictions(None)
+        rows = list(zip(batch["labels"][0], batch["visible"] != 0))
+        for predicted, (labels, visible) in zip(of_whole, rows):
+            whole.add(predicted, labels, visible)
+        for others, covered, without, with_it in masked:
+            for predicted, before, (labels, visible) in zip(predictions(others), of_whole, rows):
+                without.add(predicted, labels, visible & covered)
+                with_it.add(before, labels, visible & covered)
+    return whole, [(without, with_it) for _, _, without, with_it in masked]
 
 
 def covered_by(rig: Rig, network: Network, kept: torch.Tensor) -> torch.Tensor:

@@ -312,7 +312,7 @@ def conv3d_norm_relu(inputs, outputs, kernel):
 
 
 class Level(nn.Module):
-    """One level's features to a volume: gather, volume branch, bird's-eye-view branch, gate."""
+    """What one level gathers to a volume: volume branch, bird's-eye-view branch, gate."""
 
     def __init__(self, network: Network, index: int):
         super().__init__()
@@ -325,8 +325,7 @@ class Level(nn.Module):
         self.aspp_xy = BottleneckAspp(channels)
         self.bev_attn_layer = EfficientVitBlock(channels, network.key_dims[index], self.grid[0])
 
-    def forward(self, features, matrices, batch, kept=None):
-        volume, plane = (matrix.mean(features, batch, kept) for matrix in matrices)
+    def forward(self, volume, plane):
         volume = volume.unflatten(1, tuple(self.grid)).permute(0, 4, 1, 2, 3)
         plane = plane.unflatten(1, tuple(self.grid[:2])).permute(0, 3, 1, 2)
         volume, plane = self.down_conv3d(volume), self.xy_conv(plane)
@@ -347,9 +346,15 @@ class ViewTransformer(nn.Module):
             setattr(self, f"refine_lvl{i}", nn.Sequential(*conv3d_norm_relu(channels[i], channels[i], 3)))
         self.imvts = nn.ModuleList(Level(network, i) for i in range(3))
 
-    def coarse(self, features, rig: Rig, batch, kept=None):
+    @staticmethod
+    def gather(features, rig: Rig, batch, kept=None):
+        """What levels 1 to 3 gather, the only thing that they know of images: the means of each one's voxels and of its columns,
+        f32 [B, rows, C]."""
+        return [[matrix.mean(x, batch, kept) for matrix in matrices] for x, matrices in zip(features, rig.levels)]
+
+    def coarse(self, gathered):
         """Refined volumes of levels 1 to 3."""
-        v1, v2, v3 = (level(x, matrices, batch, kept) for level, x, matrices in zip(self.imvts, features, rig.levels))
+        v1, v2, v3 = (level(*means) for level, means in zip(self.imvts, gathered))
         r3 = self.refine_lvl3(v3)
         # oneDNN's bf16 gradient of a transposed convolution reads memory that nobody wrote where an axis has length 1.
         with torch.autocast(r3.device.type, enabled=False):
@@ -363,7 +368,7 @@ class ViewTransformer(nn.Module):
         return self.refine_lvl0(self.up_sample1(r1))
 
     def forward(self, features, rig: Rig, batch, kept=None):
-        r1, r2, r3 = self.coarse(features, rig, batch, kept)
+        r1, r2, r3 = self.coarse(self.gather(features, rig, batch, kept))
         return self.fine(r1), r1, r2, r3
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 
 from . import rigs
-from .across import across, summary
+from .across import across, load_rig, summary
 from .calibrate import calibrated
 from .config import Config
 from .data import Frames
@@ -58,11 +58,26 @@ def train_model(config: Config, work: Path, voxcast: Program, device: torch.devi
     model = InverseMatrixVT3D(network)
     model.load_state_dict(state["average"])
     if config.tail is not None:
-        voxcast.make_set(work / "tail", config.tail.first, config.tail.count, network_path)
-        train_tail(model, rig, Frames([work / "tail"], network, pixels=False), config.tail, device, config.seed)
+        train_tail(model, tail_sets(config, work, names, lidar2img, rig, voxcast, device), config.tail, device, config.seed)
     export(calibrated(model, rig, tuning, device), work / "checkpoint.safetensors", half=True)
-    voxcast("import", work / "checkpoint.safetensors", "--network", network_path, "--precision", "f16", "-o", work / "model.safetensors")
+    voxcast("import", work / "checkpoint.safetensors", "--network", network_path, "--precision", "f16", "--exact", "-o",
+            work / "model.safetensors")  # fmt: skip
     return state["step"]
+
+
+def tail_sets(config: Config, work: Path, names: list, lidar2img: torch.Tensor, plain: Rig, voxcast: Program, device: torch.device) -> list:
+    """Rigs of a tail and the frames drawn for each, the plain one first; the others lie in `work`/tail-NN."""
+    tail, network, network_path = config.tail, config.load_network(), config.directory / config.network
+    sets = []
+    for number in range(1 + (0 if tail.jitter is None else tail.jitter.rigs)):
+        seeds, rig, calibration, directory = tail.seeds_of(number), plain, None, work / "tail"
+        if number > 0:
+            moved = rigs.jittered(lidar2img, tail.jitter.degrees, tail.jitter.metres, 1000 * config.seed + number)
+            calibration = rigs.make(work / f"tail-{number:02}", names, moved, network, network_path, voxcast)
+            rig, directory = load_rig(calibration.parent, network, device), calibration.parent / "set"
+        voxcast.make_set(directory, seeds.first, seeds.count, network_path, calibration)
+        sets.append((rig, Frames([directory], network, pixels=False)))
+    return sets
 
 
 def make_rigs(config: Config, work: Path, names: list, lidar2img: torch.Tensor, voxcast: Program) -> None:

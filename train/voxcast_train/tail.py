@@ -1,11 +1,12 @@
-"""Trains the last stage alone: what makes the classes of level 0 out of the volume of level 1.
+"""Trains the end of a network alone: the last stage, which makes the classes of level 0 out of the volume of level 1, or, with
+`--volumes`, everything behind the gather.
 
     python -m voxcast_train.tail --network network.json --checkpoint checkpoint.safetensors --rig rig.safetensors --set DIR \\
         --steps 400 -o better.safetensors
 
 Most of a network's time goes into what comes before. That is run once for every frame, and its result is kept; a step then
-takes a tenth of a whole one's time, which makes it something that a CPU can do. Batch norms keep their statistics. Use frames that
-nothing was trained on: the volumes of others are better than those of new streets are.
+takes a tenth of a whole one's time, or a third, which makes it something that a CPU can do. Batch norms keep their statistics. Use
+frames that nothing was trained on: what the network makes of others is better than what it makes of new streets.
 """
 
 import argparse
@@ -26,6 +27,10 @@ from .network import InverseMatrixVT3D, Network
 from .rig import Rig, Rigs
 
 STAGE = ("view_transformer.up_sample1.", "view_transformer.refine_lvl0.", "occ_head.mlp_occ_lvl0.")
+"""How parameters of the last stage begin."""
+
+VOLUMES = ("view_transformer.", "occ_head.mlp_occ_lvl0.")
+"""And those of everything behind the gather."""
 
 PHASE = Phase(focal=2.0, lovasz=3.0, geometric=0.5, semantic=0.2, class_power=0.1)
 """Weights of the losses: those of the end of a run."""
@@ -35,40 +40,57 @@ DECAY = 0.99
 
 
 @torch.no_grad()
-def coarse_volumes(model: InverseMatrixVT3D, rig: Rig, frames: Frames, masked: float, device: torch.device) -> Tensor:
-    """Volumes [frames, C, X, Y, Z] of level 1, f16; of a share of the frames without one of the cameras."""
-    volumes = []
+def inputs_of(model: InverseMatrixVT3D, rig: Rig, frames: Frames, tail: Tail, device: torch.device) -> Tensor:
+    """What the trained part is given of each frame, f16: the volume [C, X, Y, Z] of level 1 or all that is gathered, one row after
+    the other [rows, C]; of a share of the frames without one of the cameras."""
+    view = model.view_transformer
+    rows = []
     for number in range(len(frames)):
         images = frames.batch([number])["images"].to(device)
-        kept = kept_cameras(1, model.network.cameras, masked, device) if masked > 0 else None
-        volumes.append(model.view_transformer.coarse(model.pyramid(images), rig, 1, kept)[0].half())
-    return torch.cat(volumes)
+        kept = kept_cameras(1, model.network.cameras, tail.masked, device) if tail.masked > 0 else None
+        with torch.autocast(device.type, torch.bfloat16, enabled=tail.precision == "bf16"):
+            gathered = view.gather(model.pyramid(images), rig, 1, kept)
+            row = torch.cat([mean for means in gathered for mean in means], 1) if tail.volumes else view.coarse(gathered)[0]
+        if number == 0:
+            rows = torch.empty((len(frames), *row.shape[1:]), dtype=torch.float16, device=device)
+        rows[number] = row[0]
+    return rows
 
 
-def train_tail(model: InverseMatrixVT3D, rig: Rig, frames: Frames, tail: Tail, device: torch.device, seed: int = 0) -> None:
-    """Changes the weights of the last stage of `model` in place. `rig` is on the device."""
+def logits_of(model: InverseMatrixVT3D, inputs: Tensor, tail: Tail) -> Tensor:
+    """Logits of level 0 from a batch of `inputs_of`."""
+    view, volume = model.view_transformer, inputs.float()
+    if tail.volumes:
+        means = volume.split([count for x, y, z in model.network.grids for count in (x * y * z, x * y)], 1)
+        volume = view.coarse(list(zip(means[::2], means[1::2])))[0]
+    return model.occ_head((view.fine(volume),), (0,))[0]
+
+
+def train_tail(model: InverseMatrixVT3D, sets: list, tail: Tail, device: torch.device, seed: int = 0) -> int:
+    """Changes the weights of the end of `model` in place. `sets` are pairs of a rig, which is on the device, and the frames that were
+    drawn for it. Returns the number of steps."""
     from .train import class_weights  # which itself needs nothing from here
 
     torch.manual_seed(seed)
-    model.to(device).eval()
-    volumes = coarse_volumes(model, rig, frames, tail.masked, device)
-    labels = frames.columns["labels0"]
-    weights = class_weights(frames.class_counts(), PHASE.class_power).to(device)
-    parameters = [p for name, p in model.named_parameters() if name.startswith(STAGE)]
+    model.to(device).eval().requires_grad_(False)
+    inputs = torch.cat([inputs_of(model, rig, frames, tail, device) for rig, frames in sets])
+    labels = torch.cat([frames.columns["labels0"] for _, frames in sets])
+    weights = class_weights(sum(frames.class_counts() for _, frames in sets), PHASE.class_power).to(device)
+    parameters = [p for name, p in model.named_parameters() if name.startswith(VOLUMES if tail.volumes else STAGE)]
     for parameter in parameters:
         parameter.requires_grad_(True)
     optimiser = torch.optim.AdamW(parameters, lr=tail.learning_rate, weight_decay=1e-4, fused=True)
     average = [p.detach().clone() for p in parameters]
-    started, shown = time.monotonic(), []
-    for step in range(tail.steps):
-        numbers = order(seed, len(frames), tail.batch, step)
-        fine = model.view_transformer.fine(volumes[numbers].float())
-        logits = model.occ_head((fine,), (0,))[0]
+    started, shown, step, done = time.monotonic(), [], 0, 0.0
+    while done < 1.0:
+        numbers = order(seed, len(labels), tail.batch, step)
+        with torch.autocast(device.type, torch.bfloat16, enabled=tail.precision == "bf16"):
+            logits = logits_of(model, inputs[numbers], tail)
         losses = level_losses(logits, labels[numbers].to(device), weights, tail.lovasz_voxels)
         total = sum(getattr(PHASE, name) * loss for name, loss in losses.items())
         warm = min(1.0, (step + 1) / 20)
         for group in optimiser.param_groups:
-            group["lr"] = tail.learning_rate * warm * 0.5 * (1.0 + math.cos(math.pi * step / tail.steps))
+            group["lr"] = tail.learning_rate * warm * 0.5 * (1.0 + math.cos(math.pi * done))
         optimiser.zero_grad(set_to_none=True)
         total.backward()
         nn.utils.clip_grad_norm_(parameters, 10.0, foreach=True)
@@ -76,26 +98,34 @@ def train_tail(model: InverseMatrixVT3D, rig: Rig, frames: Frames, tail: Tail, d
         with torch.no_grad():
             torch._foreach_lerp_(average, parameters, 1.0 - min(DECAY, (1.0 + step) / (10.0 + step)))
         shown.append({name: float(loss.detach()) for name, loss in losses.items()})
-        if len(shown) == 20 or step + 1 == tail.steps:
+        step += 1
+        seconds = time.monotonic() - started
+        done = step / tail.steps if tail.minutes is None else seconds / (60.0 * tail.minutes)
+        if len(shown) == 20 or done >= 1.0:
             means = "  ".join(f"{name} {sum(row[name] for row in shown) / len(shown):.3f}" for name in shown[0])
-            print(f"tail {step + 1}/{tail.steps}  {means}  {(time.monotonic() - started) / (step + 1):.2f} s a step", flush=True)
+            print(f"tail {step}, {100 * min(done, 1.0):.0f} %  {means}  {seconds / step:.2f} s a step", flush=True)
             shown = []
     with torch.no_grad():
         for parameter, value in zip(parameters, average):
             parameter.copy_(value)
+    return step
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="voxcast_train.tail", description="Train the last stage of a network alone.")
+    parser = argparse.ArgumentParser(prog="voxcast_train.tail", description="Train the end of a network alone.")
     parser.add_argument("--network", required=True)
     parser.add_argument("--checkpoint", required=True, help="of voxcast_train.export")
-    parser.add_argument("--rig", required=True)
+    parser.add_argument("--rig", required=True, action="append", help="given again: one for each --set, in the same order")
     parser.add_argument("--set", required=True, action="append", help="a set of frames; may be given again")
-    parser.add_argument("--limit", type=int, help="the first so many frames; each takes some 3 MB")
+    parser.add_argument("--limit", type=int, help="the first so many frames of each set; each takes some 3 MB")
+    parser.add_argument("--volumes", action="store_true", help="train everything behind the gather, not the last stage alone")
     parser.add_argument("--steps", type=int, default=Tail.steps)
+    parser.add_argument("--minutes", type=float, help="time to train for, instead of steps")
     parser.add_argument("--batch", type=int, default=Tail.batch)
     parser.add_argument("--learning-rate", type=float, default=Tail.learning_rate)
+    parser.add_argument("--lovasz-voxels", type=int, default=Tail.lovasz_voxels, help="those that Lovasz-softmax sees of a batch")
     parser.add_argument("--masked", type=float, default=Tail.masked, help="share of the frames that lose a camera")
+    parser.add_argument("--precision", choices=("f32", "bf16"), default=Tail.precision)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
@@ -104,11 +134,15 @@ def main() -> int:
     torch.set_num_threads(options.threads)
     try:
         network, device = Network.load(options.network), torch.device(options.device)
-        frames = Frames(options.set, network, pixels=False, limit=options.limit)
-        rig = Rigs([Rig.load(options.rig, network)], device).select(0)
+        if len(options.rig) not in (1, len(options.set)):
+            raise InputError(f"--rig: found {len(options.rig)}, expected one, or one for each of the {len(options.set)} sets")
+        loaded = [Rigs([Rig.load(path, network)], device).select(0) for path in options.rig]
+        sets = [Frames([path], network, pixels=False, limit=options.limit) for path in options.set]
         model = load_model(network, options.checkpoint)
-        tail = Tail(steps=options.steps, batch=options.batch, learning_rate=options.learning_rate, masked=options.masked)
-        train_tail(model, rig, frames, tail, device, options.seed)
+        tail = Tail(steps=options.steps, minutes=options.minutes, batch=options.batch, learning_rate=options.learning_rate,
+                    masked=options.masked, lovasz_voxels=options.lovasz_voxels, volumes=options.volumes,
+                    precision=options.precision)  # fmt: skip
+        train_tail(model, list(zip(loaded * len(sets) if len(loaded) == 1 else loaded, sets)), tail, device, options.seed)
         export(model.state_dict(), options.output, half=True)
     except (InputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
