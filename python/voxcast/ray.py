@@ -200,7 +200,7 @@ class _Runner:
             digests.append(result.logits_digest)
         if result.confidence_occupied is not None and result.confidence_class is not None:
             confidence = (result.confidence_occupied, result.confidence_class)
-            digests += [blake2b(codes, digest_size=8).hexdigest() for codes in confidence]
+            digests += [blake2b(codes.tobytes(), digest_size=8).hexdigest() for codes in confidence]
         return _Frame(result.classes, result.support, result.logits, confidence, tuple(digests))
 
 
