@@ -178,7 +178,7 @@ class Run(unittest.TestCase):
         source = self.work_of("source")
         run(self.config("source", steps=60), source, CPU)
         export(torch.load(source / "state.pt", weights_only=True)["average"], source / "checkpoint.safetensors")
-        made = ("--network", self.work / "network.json", "--precision", "f16", "-o", source / "model")
+        made = ("--network", self.work / "network.json", "--precision", "f16", "--exact", "-o", source / "model")
         voxcast("import", source / "checkpoint.safetensors", *made)
         network = self.config("source").load_network()
         rig = Rig.load(source / "rig.safetensors", network)
@@ -210,6 +210,9 @@ class Run(unittest.TestCase):
         self.assertEqual(["focal0" in row for row in rows if row["kind"] == "train"], [False, True])
         before, after = (torch.load(path / "state.pt", weights_only=True)["average"] for path in (source, work))
         self.assertEqual(before.keys(), after.keys())
+        voxcast("import", source / "checkpoint.safetensors", "--network", self.work / "network.json", "-o", source / "fast")
+        with self.assertRaisesRegex(InputError, "winograd: found .*expected direct sums"):
+            unpack(source / "fast", unpacked)
         with self.assertRaisesRegex(InputError, "format: found None"):
             unpack(source / "checkpoint.safetensors", unpacked)
         other = Network.load(made_up.write_network(work, fpn=24))

@@ -47,6 +47,8 @@ class Packed:
                 raise InputError(f"{path}: format: found {metadata.get('format')}, expected voxcast-model-1")
             if metadata.get("batch_norm") != "folded":
                 raise InputError(f"{path}: batch_norm: found {metadata.get('batch_norm')}, expected folded")
+            if "winograd" in metadata:
+                raise InputError(f"{path}: winograd: found {metadata['winograd']}, expected direct sums, as import --exact makes them")
             self.network = json.loads(metadata["network"])
             self.tensors = {name: file.get_tensor(name) for name in file.keys()}
 
