@@ -17,7 +17,7 @@ use voxcast::rig::RigBuilder;
 use voxcast::session::views;
 use voxcast::weights::Precision;
 use voxcast::{Isa, Model, Network, Rig, Scene, Session, SessionOptions, Threads};
-use voxcast_kernels::cases::isas;
+use voxcast_kernels::cases::{isas, isas_in_words};
 
 #[path = "support/weights.rs"]
 mod weights;
@@ -326,6 +326,9 @@ fn channels_first(values: &[u8], rows: usize, channels: usize) -> Vec<u8> {
 fn integers_equal_the_reference() {
     let cases: Vec<Case> = cases().into_iter().filter(|case| case.ranges.is_some()).collect();
     assert!(!cases.is_empty());
+    // Not `eprintln`, which the harness would keep to itself.
+    let said = format!("int8 networks are compared on: {}\n", isas_in_words());
+    std::io::Write::write_all(&mut std::io::stderr(), said.as_bytes()).expect("standard error");
     for case in cases {
         let (bytes, ranges) = case.ranges.as_ref().unwrap();
         let expected = SafeTensors::deserialize(bytes).unwrap();
