@@ -208,6 +208,13 @@ pub(crate) trait Simd: Copy {
     fn narrow(self, a: Self::I) -> Self::B;
     /// `a >= b` in every lane: false where either is NaN.
     fn at_least(self, a: Self::V, b: Self::V) -> Self::M;
+    /// `a > b` in every lane: false where either is NaN.
+    fn exceeds(self, a: Self::V, b: Self::V) -> Self::M;
+    /// Writes the transpose of 16 rows of 16, which are `stride` apart, to `to`, row after row.
+    ///
+    /// # Safety
+    /// `from` must be valid for reading 16 values at every multiple of `stride` below 16 times that, `to` for writing 256.
+    unsafe fn transpose_ptr(self, from: *const f32, stride: usize, to: *mut f32);
     /// Where both hold.
     fn both(self, a: Self::M, b: Self::M) -> Self::M;
 

@@ -228,23 +228,47 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
                     first: k == 0,
                     last: k + depth == self.depth,
                 };
-                let mut panel = 0;
-                while panel < panels {
-                    let (k, offsets) = (k..k + depth, &offsets[..count]);
-                    if A::PANELS == 2 && panels - panel >= 2 {
-                        self.panels::<A, S, E, _, 2>(s, arithmetic, &block, epilogue, panel, k, offsets, out, spare);
-                        panel += 2;
-                    } else {
-                        self.panels::<A, S, E, _, 1>(s, arithmetic, &block, epilogue, panel, k, offsets, out, spare);
-                        panel += 1;
-                    }
-                }
+                self.block(s, arithmetic, &block, epilogue, k..k + depth, &offsets[..count], out, spare);
                 k += depth;
                 if k == self.depth {
                     break;
                 }
             }
             first += count;
+        }
+    }
+
+    /// All panels of a block of rows and k.
+    #[inline(always)]
+    #[allow(clippy::too_many_arguments, reason = "the state of the loops around it")]
+    pub(crate) fn block<A, S, E, B>(
+        &self,
+        s: S,
+        arithmetic: A,
+        block: &Block<'_, B, T>,
+        epilogue: &mut E,
+        k: Range<usize>,
+        offsets: &[usize],
+        out: &mut [E::Out],
+        spare: &mut [A::Right],
+    ) where
+        S: Simd,
+        A: Arithmetic<S, Left = L::Element>,
+        W: Packed<S, Element = A::Right>,
+        E: Epilogue<S, A>,
+        B: Left<A::Left>,
+    {
+        let panels = self.columns.div_ceil(LANES);
+        let mut panel = 0;
+        while panel < panels {
+            let k = k.clone();
+            if A::PANELS == 2 && panels - panel >= 2 {
+                self.panels::<A, S, E, B, 2>(s, arithmetic, block, epilogue, panel, k, offsets, out, spare);
+                panel += 2;
+            } else {
+                self.panels::<A, S, E, B, 1>(s, arithmetic, block, epilogue, panel, k, offsets, out, spare);
+                panel += 1;
+            }
         }
     }
 

@@ -81,7 +81,15 @@ pub(crate) trait Multiply {
 }
 
 impl Product<'_> {
-    fn end(&self) -> End<'_> {
+    /// # Panics
+    /// If weights or bias do not have the size that the shapes ask for.
+    pub(crate) fn check_right(&self) {
+        let padded = self.columns.checked_next_multiple_of(LANES).expect("the columns overflow");
+        assert_eq!(Some(self.weights.len()), padded.checked_mul(self.depth), "packed weights do not match the shape");
+        assert!(self.bias.len() >= padded, "the bias is shorter than the columns");
+    }
+
+    pub(crate) fn end(&self) -> End<'_> {
         End { bias: Some(self.bias), relu: self.relu, residual: self.residual }
     }
 }
@@ -96,9 +104,7 @@ impl Multiply for Product<'_> {
     }
 
     fn check(&self, rows: usize, scratch: &[f32]) {
-        let padded = self.columns.checked_next_multiple_of(LANES).expect("the columns overflow");
-        assert_eq!(Some(self.weights.len()), padded.checked_mul(self.depth), "packed weights do not match the shape");
-        assert!(self.bias.len() >= padded, "the bias is shorter than the columns");
+        self.check_right();
         if let Residual::Before { rows: added, stride } | Residual::After { rows: added, stride } = self.residual {
             assert!(added.len() >= span(rows, stride, self.columns), "the residual is shorter than the rows");
         }
@@ -161,13 +167,20 @@ pub(crate) struct Rows<'a, P: Multiply, A> {
 }
 
 impl<P: Multiply, A: Source<Element = P::Left>> Rows<'_, P, A> {
+    /// # Panics
+    /// As [`Multiply::check_rows`].
+    #[inline]
+    pub(crate) fn check(&self, total: usize) {
+        self.product.check_rows(&self.rows, total, self.stride, self.out, self.scratch);
+    }
+
     /// Computes the rows, of `total`, on `isa`.
     ///
     /// # Panics
     /// As [`Multiply::check_rows`].
     #[inline]
     pub(crate) fn compute(self, isa: Isa, total: usize) {
-        self.product.check_rows(&self.rows, total, self.stride, self.out, self.scratch);
+        self.check(total);
         dispatch(isa, self);
     }
 }

@@ -8,12 +8,15 @@
 //! A two-dimensional image is a volume of depth 1. Taps outside the input count as x = 0 and stay in the chain. The sum
 //! is a [`crate::product`]: k runs over (kd, kh, kw, c), and with an undilated last axis the taps kw and their channels
 //! are one contiguous run of memory, so a row of the virtual left matrix is a handful of copies. A 1x1 convolution
-//! needs none: its rows lie in memory already.
+//! needs none: its rows lie in memory already. Where an image has few channels, the runs of neighbouring positions overlap:
+//! lines are copied once with the zeros at both their ends, and rows of the matrix are read out of them (`lines.rs`).
 
 use crate::isa::Isa;
 use crate::matmul::Product;
 use crate::matmul::product::Rows;
+use crate::simd::dispatch;
 use core::ops::Range;
+use lines::Lines;
 
 pub use walk::Geometry;
 pub(crate) use walk::Walk;
@@ -40,8 +43,14 @@ pub struct Conv<'a> {
 pub fn conv(isa: Isa, args: &Conv<'_>, rows: Range<usize>, stride: usize, out: &mut [f32], scratch: &mut [f32]) {
     args.geometry.check(args.input);
     assert_eq!(args.product.depth, args.geometry.depth(), "the weights belong to another kernel");
-    Rows { product: &args.product, source: &args.walk(), rows, stride, out, scratch }
-        .compute(isa, args.geometry.rows());
+    let walk = args.walk();
+    let rows = Rows { product: &args.product, source: &walk, rows, stride, out, scratch };
+    if lines::suit(&args.geometry) {
+        rows.check(args.geometry.rows());
+        dispatch(isa, Lines(rows));
+    } else {
+        rows.compute(isa, args.geometry.rows());
+    }
 }
 
 impl<'a> Conv<'a> {
@@ -50,6 +59,7 @@ impl<'a> Conv<'a> {
     }
 }
 
+mod lines;
 mod walk;
 
 #[cfg(feature = "cases")]

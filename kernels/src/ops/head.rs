@@ -4,19 +4,23 @@
 //! a = relu(W1 x + b1),  b = relu(W2 a + b2),  logits = W3 b + b3,  class = first k with the largest logits[k]
 //! ```
 //!
-//! Each layer is a [`crate::product`]. A block of voxels goes through all three while it is in the cache, so the logits
-//! of the whole grid need not exist. A later class wins only if its logit is greater, so NaN never wins over a value
-//! that comes first. Beside the classes, logits can be kept, and [how sure](Confidence) the head is.
+//! Each layer is a product, one chain of fused multiply-adds per output that starts at the bias, k ascending. A later class wins
+//! only if its logit is greater, so NaN never wins over a value that comes first. Beside the classes, logits can be kept, and
+//! [how sure](Confidence) the head is.
+//!
+//! Lanes are voxels: as many voxels as a vector has go through all layers at once, and what one layer writes, channel by channel, is
+//! what the next one reads. So there are no columns of padding (17 classes would be 32), hidden layers stay in the
+//! first-level cache, and the largest class is found in all voxels at once. Only the input has to be transposed.
 
 pub(crate) mod confidence;
 
 pub use confidence::Confidence;
 
 use crate::isa::Isa;
-use crate::matmul::driver::{Linear, Source};
+use crate::matmul::layout::packed_index;
 use crate::matmul::product::Multiply;
-use crate::matmul::{BLOCK_ROWS, Panels, Product, Residual, SCRATCH};
-use crate::simd::{Kernel, Simd, dispatch};
+use crate::matmul::{Panels, Product, Residual};
+use crate::simd::{Kernel, LANES, Simd, dispatch};
 use core::convert::identity;
 use core::ops::Range;
 
@@ -63,7 +67,12 @@ impl Results<'_> {
 
 /// f32 of scratch that one call needs.
 pub const fn scratch_len(channels: usize, classes: usize) -> usize {
-    SCRATCH + BLOCK_ROWS * (2 * channels + classes)
+    matrices_len(channels, classes) + LANES * (3 * channels + 2 * classes)
+}
+
+/// f32 of the three matrices side by side. What is stored last of a matrix may reach beyond its end.
+const fn matrices_len(channels: usize, classes: usize) -> usize {
+    channels * (2 * channels + classes) + LANES
 }
 
 /// Classifies the voxels `rows` into `results`.
@@ -75,7 +84,7 @@ pub const fn scratch_len(channels: usize, classes: usize) -> usize {
 /// The same bits on every instruction set and for every division into rows.
 pub fn head(isa: Isa, args: &Head<'_>, rows: Range<usize>, results: Results<'_>, scratch: &mut [f32]) {
     results.check(rows.len(), args.classes);
-    (0..3).for_each(|layer| args.layer(layer).check(rows.len(), scratch));
+    (0..3).for_each(|layer| args.layer(layer).check_right());
     let held = rows.end.checked_mul(args.channels).is_some_and(|n| n <= args.input.len());
     assert!(rows.start <= rows.end && held, "rows {rows:?} are not in the input");
     assert!(scratch.len() >= scratch_len(args.channels, args.classes), "the scratch is too small");
@@ -92,39 +101,6 @@ impl<'a> Head<'a> {
             relu: layer < 2,
             residual: Residual::None,
         }
-    }
-}
-
-/// Rows that lie in memory, densely.
-pub(crate) struct Rows<'a, E> {
-    pub(crate) data: &'a [E],
-    pub(crate) stride: usize,
-}
-
-impl<E: Copy> Source for Rows<'_, E> {
-    type Element = E;
-    type At = usize;
-    type Part = usize;
-
-    #[inline(always)]
-    fn element(&self, row: usize, k: usize) -> E {
-        self.data[row * self.stride + k]
-    }
-    #[inline(always)]
-    fn at(&self, row: usize) -> usize {
-        row
-    }
-    #[inline(always)]
-    fn next(&self, row: usize) -> usize {
-        row + 1
-    }
-    #[inline(always)]
-    fn part(&self, k: usize) -> (usize, usize) {
-        (k, self.stride - k)
-    }
-    #[inline(always)]
-    fn piece<'a, S: Simd>(&'a self, _: S, row: usize, k: usize, spare: &'a mut [E]) -> &'a [E] {
-        &self.data[row * self.stride + k..][..spare.len()]
     }
 }
 
@@ -147,86 +123,82 @@ struct Run<'a> {
     scratch: &'a mut [f32],
 }
 
-impl Run<'_> {
-    /// Calls `block` with the first voxel and count of each block of rows and with room for its two hidden layers, its
-    /// logits and a product's scratch; then keeps what was asked for. `sure` writes how sure the head is of a block, of its
-    /// logits and classes.
-    #[inline(always)]
-    fn blocks(
-        mut self,
-        mut block: impl FnMut(usize, usize, [&mut [f32]; 4]),
-        sure: impl Fn(&[f32], &[u8], Confidence<'_>),
-    ) {
-        let Head { channels, classes, .. } = *self.args;
-        let (product, rest) = self.scratch.split_at_mut(SCRATCH);
-        let (a, rest) = rest.split_at_mut(BLOCK_ROWS * channels);
-        let (b, rest) = rest.split_at_mut(BLOCK_ROWS * channels);
-        let logits = &mut rest[..BLOCK_ROWS * classes];
-        for first in self.rows.clone().step_by(BLOCK_ROWS) {
-            let count = BLOCK_ROWS.min(self.rows.end - first);
-            block(first, count, [a, b, logits, product]);
-            let at = first - self.rows.start;
-            let logits = &logits[..count * classes];
-            let chosen = &mut self.results.classes[at..at + count];
-            for (class, logits) in chosen.iter_mut().zip(logits.chunks_exact(classes)) {
-                *class = largest(logits);
-            }
-            if let Some(out) = &mut self.results.logits {
-                out[at * classes..(at + count) * classes].copy_from_slice(logits);
-            }
-            if let Some(confidence) = &mut self.results.confidence {
-                sure(logits, chosen, confidence.part(at..at + count));
-            }
-        }
-    }
-}
-
 impl Kernel for Run<'_> {
     type Output = ();
 
     #[inline(always)]
     fn reference(self) {
-        let args = self.args;
-        self.blocks(
-            #[inline(always)]
-            |first, count, [a, b, logits, _]| {
-                let input = &args.input[first * args.channels..];
-                for layer in 0..3 {
-                    let (data, to) = between(layer, input, a, b, logits);
-                    let p = args.layer(layer);
-                    let source = Rows { data, stride: p.depth };
-                    for (row, to) in to.chunks_exact_mut(p.columns.max(1)).take(count).enumerate() {
-                        p.reference(
-                            row,
-                            to,
-                            #[inline(always)]
-                            |k| source.element(row, k),
-                        );
-                    }
-                }
-            },
-            #[inline(always)]
-            |logits, chosen, confidence| confidence.reference(args.classes, chosen, logits, identity),
-        );
+        let Self { args, rows, mut results, scratch } = self;
+        let (a, rest) = scratch.split_at_mut(args.channels);
+        let (b, rest) = rest.split_at_mut(args.channels);
+        let logits = &mut rest[..args.classes];
+        for (i, row) in rows.enumerate() {
+            let input = &args.input[row * args.channels..][..args.channels];
+            for layer in 0..3 {
+                let (from, to) = between(layer, input, a, b, logits);
+                args.layer(layer).reference(
+                    row,
+                    to,
+                    #[inline(always)]
+                    |k| from[k],
+                );
+            }
+            results.classes[i] = largest(logits);
+            if let Some(out) = &mut results.logits {
+                out[i * args.classes..][..args.classes].copy_from_slice(logits);
+            }
+            if let Some(confidence) = &mut results.confidence {
+                confidence.part(i..i + 1).reference(args.classes, &results.classes[i..=i], logits, identity);
+            }
+        }
     }
 
     #[inline(always)]
     fn run<S: Simd>(self, s: S) {
-        let args = self.args;
-        self.blocks(
-            #[inline(always)]
-            |first, count, [a, b, logits, scratch]| {
-                let input = &args.input[first * args.channels..];
-                for layer in 0..3 {
-                    let (data, to) = between(layer, input, a, b, logits);
-                    let p = args.layer(layer);
-                    let (source, target) = (Rows { data, stride: p.depth }, Linear { first: 0, stride: p.columns });
-                    p.compute(s, &source, &target, 0..count, to, scratch);
+        let Self { args, rows, mut results, scratch } = self;
+        let Head { channels, classes, .. } = *args;
+        let (matrices, rest) = scratch.split_at_mut(matrices_len(channels, classes));
+        let (x, rest) = rest.split_at_mut(channels * LANES);
+        let (a, rest) = rest.split_at_mut(channels * LANES);
+        let (b, rest) = rest.split_at_mut(channels * LANES);
+        let (logits, rest) = rest.split_at_mut(classes * LANES);
+        let by_voxel = &mut rest[..classes * LANES];
+        let mut starts = [0; 3];
+        let mut end = 0;
+        for layer in 0..3 {
+            starts[layer] = end;
+            args.layer(layer).spread(s, &mut matrices[end..]);
+            end += channels * args.layer(layer).columns;
+        }
+        for first in rows.clone().step_by(LANES) {
+            let count = LANES.min(rows.end - first);
+            transpose(s, &args.input[first * channels..(first + count) * channels], channels, x);
+            for layer in 0..3 {
+                let (from, to) = between(layer, x, a, b, logits);
+                let Product { bias, columns, relu, .. } = args.layer(layer);
+                let matrix = &matrices[starts[layer]..][..channels * columns];
+                Columns { matrix, from, relu }.all(s, bias, to);
+            }
+            let at = first - rows.start;
+            let chosen = &mut results.classes[at..at + count];
+            for (class, largest) in chosen.iter_mut().zip(largest_of_lanes(s, logits)) {
+                *class = largest as u8;
+            }
+            if results.logits.is_some() || results.confidence.is_some() {
+                for (k, logits) in logits.as_chunks::<LANES>().0.iter().enumerate() {
+                    for (voxel, logit) in logits.iter().enumerate() {
+                        by_voxel[voxel * classes + k] = *logit;
+                    }
                 }
-            },
-            #[inline(always)]
-            |logits, chosen, confidence| confidence.run(s, args.classes, chosen, logits, identity),
-        );
+                let logits = &by_voxel[..count * classes];
+                if let Some(out) = &mut results.logits {
+                    out[at * classes..(at + count) * classes].copy_from_slice(logits);
+                }
+                if let Some(confidence) = &mut results.confidence {
+                    confidence.part(at..at + count).run(s, classes, chosen, logits, identity);
+                }
+            }
+        }
     }
 }
 
@@ -243,6 +215,114 @@ fn between<'a>(
         0 => (input, a),
         1 => (a, b),
         _ => (b, logits),
+    }
+}
+
+impl Product<'_> {
+    /// Writes the weights into `out`, row by row without padding.
+    #[inline(always)]
+    fn spread<S: Simd>(&self, s: S, out: &mut [f32]) {
+        // In this order, what is stored beyond the end of a row is overwritten by the next one.
+        for k in 0..self.depth {
+            for column in (0..self.columns).step_by(LANES) {
+                let i = packed_index(self.depth, k, column);
+                let to = out[k * self.columns + column..].first_chunk_mut().expect("there is room behind the matrices");
+                match self.weights {
+                    Panels::F32(w) => *to = *w[i..].first_chunk().expect("panels are whole"),
+                    Panels::F16(w) => s.store(to, s.widen(w[i..].first_chunk().expect("panels are whole"))),
+                }
+            }
+        }
+    }
+}
+
+/// Writes rows of `channels` channels, at most 16 of them, into `out`, channel by channel. Voxels that do not exist are 0.
+#[inline(always)]
+fn transpose<S: Simd>(s: S, rows: &[f32], channels: usize, out: &mut [f32]) {
+    let mut done = 0;
+    if rows.len() == channels * LANES {
+        while done + LANES <= channels {
+            let to = &mut out[done * LANES..][..LANES * LANES];
+            // SAFETY: there are 16 rows, each of which has 16 more channels from `done` on, and as many in `to`.
+            unsafe { s.transpose_ptr(rows[done..].as_ptr(), channels, to.as_mut_ptr()) }
+            done += LANES;
+        }
+    }
+    for (c, out) in out.as_chunks_mut::<LANES>().0.iter_mut().enumerate().skip(done) {
+        *out = [0.0; LANES];
+        for (lane, row) in out.iter_mut().zip(rows.chunks_exact(channels)) {
+            *lane = row[c];
+        }
+    }
+}
+
+/// The first of the largest logits of each lane.
+#[inline(always)]
+fn largest_of_lanes<S: Simd>(s: S, logits: &[f32]) -> [i32; LANES] {
+    let (logits, _) = logits.as_chunks::<LANES>();
+    let (mut best, mut class) = (s.load(&logits[0]), s.splat_int(0));
+    for (logits, k) in logits.iter().zip(0..).skip(1) {
+        let logit = s.load(logits);
+        // Classes ascend, so the larger is the later.
+        class = s.max_int(class, s.keep(s.exceeds(logit, best), s.splat_int(k)));
+        best = s.max(logit, best);
+    }
+    s.int_lanes(class)
+}
+
+/// A layer over the voxels of a vector.
+struct Columns<'a> {
+    /// `[k, columns]`.
+    matrix: &'a [f32],
+    /// `[k, voxels]`.
+    from: &'a [f32],
+    relu: bool,
+}
+
+impl Columns<'_> {
+    /// Writes all columns, `[columns, voxels]`, as many at a time as a tile has rows, or nearly.
+    #[inline(always)]
+    fn all<S: Simd>(&self, s: S, bias: &[f32], to: &mut [f32]) {
+        let (to, _) = to.as_chunks_mut::<LANES>();
+        let columns = to.len();
+        let mut tiles = columns.div_ceil(S::TILE.rows);
+        let mut first = 0;
+        while first < columns {
+            let count = (columns - first).div_ceil(tiles);
+            let (bias, to) = (&bias[first..first + count], &mut to[first..first + count]);
+            macro_rules! tile {
+                ($($n:literal)*) => {
+                    match count {
+                        $($n if $n <= S::TILE.rows => self.some::<S, $n>(s, columns, first, bias, to),)*
+                        _ => unreachable!("a tile has at most 12 rows"),
+                    }
+                };
+            }
+            tile!(1 2 3 4 5 6 7 8 9 10 11 12);
+            first += count;
+            tiles -= 1;
+        }
+    }
+
+    /// Writes the `N` columns from `first` on, of `columns`.
+    #[inline(always)]
+    fn some<S: Simd, const N: usize>(&self, s: S, columns: usize, first: usize, bias: &[f32], to: &mut [[f32; LANES]]) {
+        let (bias, to): (&[f32; N], &mut [_; N]) =
+            (bias.try_into().expect("N of them"), to.try_into().expect("N of them"));
+        let mut sums = [s.splat(0.0); N];
+        for r in 0..N {
+            sums[r] = s.splat(bias[r]);
+        }
+        for (x, weights) in self.from.as_chunks::<LANES>().0.iter().zip(self.matrix.chunks_exact(columns)) {
+            let x = s.load(x);
+            let weights: &[f32; N] = weights[first..first + N].try_into().expect("N of them");
+            for r in 0..N {
+                sums[r] = s.mul_add(x, s.splat(weights[r]), sums[r]);
+            }
+        }
+        for r in 0..N {
+            s.store(&mut to[r], if self.relu { s.relu(sums[r]) } else { sums[r] });
+        }
     }
 }
 

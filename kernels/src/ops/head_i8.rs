@@ -11,11 +11,11 @@
 //! Channels are a multiple of 4. Beside the classes, logits can be kept, and [how sure](crate::head::Confidence) the head is.
 
 use crate::isa::Isa;
-use crate::matmul::driver::Linear;
+use crate::matmul::driver::{Linear, Source};
 use crate::matmul::int8::{self, Narrow, Raw};
 use crate::matmul::product::Multiply;
 use crate::matmul::{BLOCK_ROWS, ProductI8, ResidualI8};
-use crate::ops::head::{Confidence, Results, Rows, largest};
+use crate::ops::head::{Confidence, Results, largest};
 use crate::simd::{Kernel, LANES, Simd, dispatch};
 use core::ops::Range;
 
@@ -100,6 +100,39 @@ impl<'a> HeadI8<'a> {
             // The last layer's sums stay as they are.
             multiplier: if layer == 2 { bias } else { self.multipliers[layer] },
         }
+    }
+}
+
+/// Rows that lie in memory, densely.
+struct Rows<'a, E> {
+    data: &'a [E],
+    stride: usize,
+}
+
+impl<E: Copy> Source for Rows<'_, E> {
+    type Element = E;
+    type At = usize;
+    type Part = usize;
+
+    #[inline(always)]
+    fn element(&self, row: usize, k: usize) -> E {
+        self.data[row * self.stride + k]
+    }
+    #[inline(always)]
+    fn at(&self, row: usize) -> usize {
+        row
+    }
+    #[inline(always)]
+    fn next(&self, row: usize) -> usize {
+        row + 1
+    }
+    #[inline(always)]
+    fn part(&self, k: usize) -> (usize, usize) {
+        (k, self.stride - k)
+    }
+    #[inline(always)]
+    fn piece<'a, S: Simd>(&'a self, _: S, row: usize, k: usize, spare: &'a mut [E]) -> &'a [E] {
+        &self.data[row * self.stride + k..][..spare.len()]
     }
 }
 

@@ -40,6 +40,59 @@ fn at_least(a: __m256, b: __m256) -> __m256 {
     _mm256_cmp_ps::<_CMP_GE_OQ>(a, b)
 }
 
+/// Where `a > b`.
+#[inline]
+#[target_feature(enable = "avx2")]
+fn exceeds(a: __m256, b: __m256) -> __m256 {
+    _mm256_cmp_ps::<_CMP_GT_OQ>(a, b)
+}
+
+/// Writes the transpose of 8 rows of 8, `stride` apart, to rows 16 apart.
+///
+/// # Safety
+/// `from` must be valid for reading 8 values at every multiple of `stride` below 8 times that, `to` for writing 8 at every
+/// multiple of 16 below 128.
+#[inline]
+#[target_feature(enable = "avx2")]
+unsafe fn transpose_eight(from: *const f32, stride: usize, to: *mut f32) {
+    // Four columns of the rows r and r + 4, so that what is left goes on within halves.
+    let four = |r: usize, column: usize| {
+        // SAFETY: r + 4 < 8 and column + 4 <= 8, which the caller promises to be readable.
+        unsafe {
+            let low = _mm_loadu_ps(from.add(r * stride + column));
+            _mm256_insertf128_ps::<1>(_mm256_castps128_ps256(low), _mm_loadu_ps(from.add((r + 4) * stride + column)))
+        }
+    };
+    for column in [0, 4] {
+        let rows = [four(0, column), four(1, column), four(2, column), four(3, column)];
+        let low = [_mm256_unpacklo_ps(rows[0], rows[1]), _mm256_unpacklo_ps(rows[2], rows[3])];
+        let high = [_mm256_unpackhi_ps(rows[0], rows[1]), _mm256_unpackhi_ps(rows[2], rows[3])];
+        let turned = [
+            _mm256_shuffle_ps::<0b01_00_01_00>(low[0], low[1]),
+            _mm256_shuffle_ps::<0b11_10_11_10>(low[0], low[1]),
+            _mm256_shuffle_ps::<0b01_00_01_00>(high[0], high[1]),
+            _mm256_shuffle_ps::<0b11_10_11_10>(high[0], high[1]),
+        ];
+        for (i, turned) in turned.into_iter().enumerate() {
+            // SAFETY: column + i < 8, and the caller promises room for 8 rows.
+            unsafe { _mm256_storeu_ps(to.add((column + i) * LANES), turned) }
+        }
+    }
+}
+
+/// [`Simd::transpose_ptr`].
+///
+/// # Safety
+/// As for that.
+#[inline]
+#[target_feature(enable = "avx2")]
+pub(super) unsafe fn transpose(from: *const f32, stride: usize, to: *mut f32) {
+    for [row, column] in [[0, 0], [0, 8], [8, 0], [8, 8]] {
+        // SAFETY: a quarter of what the caller promises.
+        unsafe { transpose_eight(from.add(row * stride + column), stride, to.add(column * LANES + row)) }
+    }
+}
+
 /// `a` where the mask holds, else 0.
 #[inline]
 #[target_feature(enable = "avx2")]
@@ -305,6 +358,15 @@ impl Simd for Avx2 {
     #[inline(always)]
     fn at_least(self, a: Self::V, b: Self::V) -> Self::M {
         halves!(at_least(a, b))
+    }
+    #[inline(always)]
+    fn exceeds(self, a: Self::V, b: Self::V) -> Self::M {
+        halves!(exceeds(a, b))
+    }
+    #[inline(always)]
+    unsafe fn transpose_ptr(self, from: *const f32, stride: usize, to: *mut f32) {
+        // SAFETY: the caller's promise is passed on; the token proves AVX2.
+        unsafe { transpose(from, stride, to) }
     }
     #[inline(always)]
     fn both(self, a: Self::M, b: Self::M) -> Self::M {

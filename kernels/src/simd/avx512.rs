@@ -244,6 +244,15 @@ impl Simd for Avx512 {
         lanewise!(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(a, b))
     }
     #[inline(always)]
+    fn exceeds(self, a: Self::V, b: Self::V) -> Self::M {
+        lanewise!(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(a, b))
+    }
+    #[inline(always)]
+    unsafe fn transpose_ptr(self, from: *const f32, stride: usize, to: *mut f32) {
+        // SAFETY: the caller's promise is passed on; the token proves AVX2.
+        unsafe { super::avx2::transpose(from, stride, to) }
+    }
+    #[inline(always)]
     fn both(self, a: Self::M, b: Self::M) -> Self::M {
         a & b
     }

@@ -364,6 +364,31 @@ impl Simd for Neon {
         quarters!(vcgeq_f32(a, b))
     }
     #[inline(always)]
+    fn exceeds(self, a: Self::V, b: Self::V) -> Self::M {
+        quarters!(vcgtq_f32(a, b))
+    }
+    #[inline(always)]
+    unsafe fn transpose_ptr(self, from: *const f32, stride: usize, to: *mut f32) {
+        for (row, column) in
+            (0..LANES).step_by(QUARTER).flat_map(|row| (0..LANES).step_by(QUARTER).map(move |c| (row, c)))
+        {
+            // SAFETY: four values in each of four rows of what the caller promises; the token proves NEON.
+            unsafe {
+                let from = from.add(row * stride + column);
+                let rows = [0, 1, 2, 3].map(|r| vld1q_f32(from.add(r * stride)));
+                // Pairs of the first two rows and of the last two, even columns and odd ones.
+                let even = [vtrn1q_f32(rows[0], rows[1]), vtrn1q_f32(rows[2], rows[3])];
+                let odd = [vtrn2q_f32(rows[0], rows[1]), vtrn2q_f32(rows[2], rows[3])];
+                let [even, odd] = [even, odd].map(|pairs| pairs.map(|x| vreinterpretq_f64_f32(x)));
+                let to = to.add(column * LANES + row);
+                vst1q_f32(to, vreinterpretq_f32_f64(vtrn1q_f64(even[0], even[1])));
+                vst1q_f32(to.add(LANES), vreinterpretq_f32_f64(vtrn1q_f64(odd[0], odd[1])));
+                vst1q_f32(to.add(2 * LANES), vreinterpretq_f32_f64(vtrn2q_f64(even[0], even[1])));
+                vst1q_f32(to.add(3 * LANES), vreinterpretq_f32_f64(vtrn2q_f64(odd[0], odd[1])));
+            }
+        }
+    }
+    #[inline(always)]
     fn both(self, a: Self::M, b: Self::M) -> Self::M {
         quarters!(vandq_u32(a, b))
     }

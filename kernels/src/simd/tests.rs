@@ -1,4 +1,4 @@
-//! The integer lanes of every instruction set against plain arithmetic.
+//! The integer lanes of every instruction set, comparisons and transposes against plain arithmetic.
 
 use super::{Kernel, LANES, Simd, dispatch};
 use crate::isa::Isa;
@@ -139,6 +139,54 @@ fn every_isa_has_the_integers_of_plain_arithmetic() {
         let want = operands.reference();
         for isa in Isa::available() {
             assert_eq!(dispatch(isa, operands), want, "{}", isa.name());
+        }
+    }
+}
+
+/// Sixteen rows of `stride` values, of which the first 16 are transposed; and where each exceeds the one behind it in its row.
+struct Turned<'a> {
+    rows: &'a [f32],
+    stride: usize,
+}
+
+impl Kernel for Turned<'_> {
+    type Output = (Vec<f32>, Vec<Lanes<i32>>);
+
+    #[inline(always)]
+    fn reference(self) -> Self::Output {
+        let at = |r: usize, c: usize| self.rows[r * self.stride + c];
+        let turned = (0..LANES * LANES).map(|i| at(i % LANES, i / LANES)).collect();
+        let exceeds = (1..LANES).map(|c| from_fn(|r| i32::from(at(r, c - 1) > at(r, c)))).collect();
+        (turned, exceeds)
+    }
+
+    #[inline(always)]
+    fn run<S: Simd>(self, s: S) -> Self::Output {
+        assert!(self.stride >= LANES && self.rows.len() >= (LANES - 1) * self.stride + LANES);
+        let mut turned = vec![f32::NAN; LANES * LANES];
+        // SAFETY: the last of 16 rows ends within `rows`, and `turned` has 256 values.
+        unsafe { s.transpose_ptr(self.rows.as_ptr(), self.stride, turned.as_mut_ptr()) }
+        let mut exceeds = vec![];
+        for pair in turned.as_chunks::<LANES>().0.windows(2) {
+            let mask = s.exceeds(s.load(&pair[0]), s.load(&pair[1]));
+            exceeds.push(s.int_lanes(s.keep(mask, s.splat_int(1))));
+        }
+        (turned, exceeds)
+    }
+}
+
+#[test]
+fn transposes_and_comparisons_are_those_of_plain_code() {
+    let mut rng = Rng::new(9);
+    for stride in [16, 17, 32, 51] {
+        // Without a value behind the last row's.
+        let rows = rng.special((LANES - 1) * stride + LANES);
+        let want = dispatch(Isa::Scalar, Turned { rows: &rows, stride });
+        assert!(want.1.iter().flatten().any(|&v| v == 1) && want.1.iter().flatten().any(|&v| v == 0));
+        for isa in Isa::available() {
+            let got = dispatch(isa, Turned { rows: &rows, stride });
+            let bits = |x: &[f32]| x.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+            assert_eq!((bits(&got.0), got.1), (bits(&want.0), want.1.clone()), "{} {stride}", isa.name());
         }
     }
 }

@@ -47,7 +47,10 @@ impl Description for Conv {
     }
 
     fn tile(&self, site: &Site<'_>, machine: Machine) -> usize {
-        product::rows_per_tile(site, machine)
+        match self.geometry.line() {
+            Some(line) => product::rows_in_units(site, machine, line),
+            None => product::rows_per_tile(site, machine),
+        }
     }
 
     fn execute(&self, call: &Call<'_>, mut tile: Tile<'_>) {

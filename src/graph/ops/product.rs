@@ -20,7 +20,12 @@ pub(super) const SCRATCH_BYTES: usize = SCRATCH * size_of::<f32>();
 
 /// Rows of a tile: about as many tiles as blocks of rows, cut so that the busiest worker has as few rows as can be.
 pub(super) fn rows_per_tile(site: &Site<'_>, machine: Machine) -> usize {
-    let (rows, workers, unit) = (site.rows(), machine.workers, machine.isa.tile().rows);
+    rows_in_units(site, machine, machine.isa.tile().rows)
+}
+
+/// As [`rows_per_tile`], a multiple of `unit`.
+pub(super) fn rows_in_units(site: &Site<'_>, machine: Machine, unit: usize) -> usize {
+    let (rows, workers) = (site.rows(), machine.workers);
     let fewest = rows.div_ceil(BLOCK_ROWS).next_multiple_of(workers);
     let most = rows.div_ceil(unit).min(fewest.saturating_mul(2)).max(fewest);
     let cuts = (fewest..=most).step_by(workers).take(CUTS).map(|tiles| rows.div_ceil(tiles).next_multiple_of(unit));

@@ -115,6 +115,13 @@ pub(crate) fn table() -> Vec<(&'static str, Geometry, usize)> {
     let flat = |h, w| [1, h, w];
     let g = geometry;
     vec![
+        ("a first layer, three blocks of a line", g(flat(9, 400), 3, [1, 7, 7], [1, 2, 2], ONE, [0, 3, 3]), 33),
+        ("lines of which all taps are padding", g([2, 3, 2], 2, [2, 3, 5], [1, 2, 3], [2, 1, 1], [3, 4, 7]), 17),
+        (
+            "six channels side by side, apart along other axes",
+            g([3, 7, 20], 6, [2, 3, 4], ONE, [1, 3, 1], [1, 2, 0]),
+            16,
+        ),
         ("1x1, one row", g(flat(1, 1), 3, ONE, ONE, ONE, [0; 3]), 1),
         ("1x1, 97 rows, 257 channels", g(flat(1, 97), 257, ONE, ONE, ONE, [0; 3]), 17),
         ("1x1, stride 2", g(flat(11, 8), 20, ONE, [1, 2, 2], ONE, [0; 3]), 33),

@@ -1,5 +1,6 @@
 //! How convolutions walk their input, whatever it is made of.
 
+use super::lines;
 use crate::matmul::driver::{Source, depth};
 use crate::simd::bytes::GROUP;
 use crate::simd::{LANES, Simd};
@@ -45,6 +46,11 @@ impl Geometry {
     /// Products per output: taps times channels.
     pub fn depth(&self) -> usize {
         self.kernel.iter().product::<usize>() * self.channels
+    }
+
+    /// Rows of a line of output, where a convolution in f32 goes line by line: it is faster with whole lines.
+    pub fn line(&self) -> Option<usize> {
+        lines::suit(self).then_some(self.output[2])
     }
 
     /// Output position of row `row`.
