@@ -23,6 +23,8 @@ impl Arena {
     pub(crate) fn new(len: usize) -> Option<Self> {
         let mut lines = Vec::new();
         lines.try_reserve_exact(len.div_ceil(ALIGNMENT)).ok()?;
+        #[cfg(target_os = "linux")]
+        ask_for_huge_pages(&mut lines);
         // Writing every line also makes every page present, so that no frame waits for one.
         lines.resize(len.div_ceil(ALIGNMENT), Line([0; ALIGNMENT]));
         Some(Self { lines })
@@ -48,6 +50,17 @@ impl Arena {
         let bytes = self.bytes_mut();
         Shared { base: bytes.as_mut_ptr(), len: bytes.len(), memory: PhantomData }
     }
+}
+
+/// Asks Linux for huge pages, which are present sooner and found faster. Nothing depends on whether there are any.
+#[cfg(target_os = "linux")]
+fn ask_for_huge_pages(lines: &mut Vec<Line>) {
+    const PAGE: usize = 4096;
+    let start = lines.as_mut_ptr().cast::<u8>();
+    let skip = start.align_offset(PAGE);
+    let len = (lines.capacity() * ALIGNMENT).saturating_sub(skip) / PAGE * PAGE;
+    // SAFETY: whole pages of memory that `lines` owns; the advice changes what backs them, not what they hold.
+    unsafe { libc::madvise(start.wrapping_add(skip).cast(), len, libc::MADV_HUGEPAGE) };
 }
 
 /// Shared access to memory while an operation runs.

@@ -7,7 +7,10 @@
 //!    ([`crate::Isa::tile`]).
 //! 3. The packed panels of a tile and k block (at most 24 KiB) stay in the first-level cache while all tiles of the row
 //!    block use them; they fetch the next ones, a share each, and the outputs of the tile that follows.
-//! 4. Half-precision weights are widened once per panel, k block and row block.
+//! 4. Where the panels of two tiles fit beside each other into the first-level cache, such tiles take turns. Rows of the output are
+//!    often a multiple of a page apart, and a tile that starts from what its columns hold would wait for the stores of the
+//!    tile above it, whose addresses look the same to the processor. So there is another tile in between.
+//! 5. Half-precision weights are widened once per panel, k block and row block.
 
 use super::epilogue::Epilogue;
 use super::layout::Packed;
@@ -45,7 +48,12 @@ pub(crate) const DEPTH: usize = depth::<f32>();
 /// f32 of a block of rows.
 pub(crate) const BLOCK_LEN: usize = BLOCK_ROWS * stride::<f32>();
 /// f32 of the panels of a tile in one k block.
-pub(crate) const PANEL_LEN: usize = DEPTH * LANES;
+pub(crate) const PANEL_LEN: usize = if DEPTH > TURNS * TURNS_DEPTH { DEPTH } else { TURNS * TURNS_DEPTH } * LANES;
+
+/// Tiles that take turns.
+const TURNS: usize = 2;
+/// Depth of a k block in f32 up to which they do.
+const TURNS_DEPTH: usize = 256;
 
 /// The left matrix. It is not stored: a source names, piece by piece, where the elements of a row lie, and copies (or
 /// samples) only those that lie nowhere in this order.
@@ -261,18 +269,19 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
         let panels = self.columns.div_ceil(LANES);
         let mut panel = 0;
         while panel < panels {
-            let k = k.clone();
-            if A::PANELS == 2 && panels - panel >= 2 {
-                self.panels::<A, S, E, B, 2>(s, arithmetic, block, epilogue, panel, k, offsets, out, spare);
+            let (k, left) = (k.clone(), panels - panel);
+            if A::PANELS == 2 && left >= 2 {
+                self.panels::<A, S, E, B, 2>(s, arithmetic, block, epilogue, panel, 1, k, offsets, out, spare);
                 panel += 2;
             } else {
-                self.panels::<A, S, E, B, 1>(s, arithmetic, block, epilogue, panel, k, offsets, out, spare);
-                panel += 1;
+                let turns = if A::PANELS == 1 && k.len() <= TURNS_DEPTH { left.min(TURNS) } else { 1 };
+                self.panels::<A, S, E, B, 1>(s, arithmetic, block, epilogue, panel, turns, k, offsets, out, spare);
+                panel += turns;
             }
         }
     }
 
-    /// All rows of `P` panels from `panel` on, in one k block.
+    /// All rows of the panels from `panel` on that tiles of `P` have which take `turns`, in one k block.
     #[inline(always)]
     #[allow(clippy::too_many_arguments, reason = "the state of the loops around it")]
     fn panels<A, S, E, B, const P: usize>(
@@ -282,6 +291,7 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
         block: &Block<'_, B, T>,
         epilogue: &mut E,
         panel: usize,
+        turns: usize,
         k: Range<usize>,
         offsets: &[usize],
         out: &mut [E::Out],
@@ -295,10 +305,11 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
     {
         let (len, count) = (k.len() * LANES, offsets.len());
         let start = |panel: usize| (panel * self.depth + k.start) * LANES;
-        let mut weights = [&[][..]; P];
-        let share = spare.len() / P;
+        let mut weights = [[&[][..]; P]; TURNS];
+        let used = P * turns;
+        let share = spare.len() / used;
         let mut spare = spare;
-        for (j, weights) in weights.iter_mut().enumerate() {
+        for (j, weights) in weights.as_flattened_mut()[..used].iter_mut().enumerate() {
             let (here, rest) = spare.split_at_mut(share);
             spare = rest;
             *weights = self.weights.read(s, start(panel + j), len, here);
@@ -307,46 +318,51 @@ impl<L: Source, W, T: Target> Product<'_, L, W, T> {
         let tile_rows = arithmetic.tile_rows(s);
         let line = LINE / size_of::<A::Right>();
         let share = len.div_ceil(count.div_ceil(tile_rows)).next_multiple_of(line);
-        let mut ahead = [core::ptr::null(); P];
-        for (j, ahead) in ahead.iter_mut().enumerate() {
-            if (panel + P + j) * LANES < self.columns {
-                *ahead = self.weights.address(start(panel + P + j));
+        let mut ahead = [[core::ptr::null(); P]; TURNS];
+        for (j, ahead) in ahead.as_flattened_mut()[..used].iter_mut().enumerate() {
+            if (panel + used + j) * LANES < self.columns {
+                *ahead = self.weights.address(start(panel + used + j));
             }
         }
         let mut i = 0;
         while i < count {
-            for ahead in ahead.iter_mut().filter(|ahead| !ahead.is_null()) {
+            for ahead in ahead.as_flattened_mut().iter_mut().filter(|ahead| !ahead.is_null()) {
                 for at in (0..share).step_by(line) {
                     s.prefetch(ahead.wrapping_add(at));
                 }
                 *ahead = ahead.wrapping_add(share);
             }
             for &offset in &offsets[(i + tile_rows).min(count)..(i + 2 * tile_rows).min(count)] {
-                for j in 0..P {
+                for j in 0..used {
                     s.prefetch(out.as_ptr().wrapping_add(offset + (panel + j) * LANES));
                 }
             }
-            // A mask that lets everything pass costs nothing, so where there are masks whole columns need no code of their
-            // own.
-            macro_rules! tile {
-                ($whole:literal) => {
-                    Tile::<A, S, B, T, E, P, $whole> {
-                        block,
-                        arithmetic,
-                        epilogue: &mut *epilogue,
-                        panels: weights,
-                        column: panel * LANES,
-                        first: i,
-                        offsets,
-                        out: &mut *out,
-                    }
+            let mut rows = 0;
+            for (turn, &panels) in weights[..turns].iter().enumerate() {
+                let column = (panel + turn * P) * LANES;
+                // A mask that lets everything pass costs nothing, so where there are masks whole columns need no code of their
+                // own.
+                macro_rules! tile {
+                    ($whole:literal) => {
+                        Tile::<A, S, B, T, E, P, $whole> {
+                            block,
+                            arithmetic,
+                            epilogue: &mut *epilogue,
+                            panels,
+                            column,
+                            first: i,
+                            offsets,
+                            out: &mut *out,
+                        }
+                    };
+                }
+                rows = if S::MASKED || self.columns - column < P * LANES {
+                    arithmetic.rows(s, count - i, tile!(false))
+                } else {
+                    arithmetic.rows(s, count - i, tile!(true))
                 };
             }
-            i += if S::MASKED || self.columns - panel * LANES < P * LANES {
-                arithmetic.rows(s, count - i, tile!(false))
-            } else {
-                arithmetic.rows(s, count - i, tile!(true))
-            };
+            i += rows;
         }
     }
 }
