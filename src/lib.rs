@@ -93,7 +93,8 @@ import(&checkpoint, &network, Options::default(), Path::new("model.safetensors")
 //!
 //! | feature | gives |
 //! |---|---|
-//! | `cli` (default) | the program `voxcast`, and the others |
+//! | `shipped` (default) | the network that ships, as a part of the program: 9.5 MB, which `voxcast demo` runs; with `cli` |
+//! | `cli` (default) | the program `voxcast`; with all below but `capi` |
 //! | `import` | `checkpoint`: reading `.pth` and `.safetensors` |
 //! | `images` | `picture`, and JPEG and PNG in [`Scene::open`] and `Scene::save` |
 //! | `npz` | `npz`: NumPy's `.npz`, written and read; `labels`: label files, read |

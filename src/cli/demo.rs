@@ -18,10 +18,21 @@ use voxcast::picture::{self, Figure, Palette};
 use voxcast::session::{Occupancy, views};
 use voxcast::synth::{CLASSES, Frame, Synthesiser};
 use voxcast::weights::Precision;
-use voxcast::{Model, Network, Result, Session, SessionOptions};
+use voxcast::{Error, Model, Network, Result, SessionOptions};
 
-/// The trained network that ships with the program (`docs/model-card.md`).
-static EDGE: &[u8] = include_bytes!("../../assets/edge.safetensors");
+/// The trained network that ships (`docs/model-card.md`), as a part of the program.
+#[cfg(feature = "shipped")]
+fn edge() -> Result<&'static [u8]> {
+    Ok(include_bytes!("../../assets/edge.safetensors"))
+}
+
+/// Says that it is not a part of the program.
+#[cfg(not(feature = "shipped"))]
+fn edge() -> Result<&'static [u8]> {
+    let message = "this program was built without the network that ships (feature `shipped`): give a model with --model FILE, \
+                   for instance assets/edge.safetensors of the source";
+    Err(Error::new(voxcast::ErrorKind::Unsupported, message))
+}
 
 /// The ranges of its tensors, measured on drawn streets (`docs/int8.md`).
 static EDGE_RANGES: &str = include_str!("../../assets/edge.ranges.json");
@@ -38,9 +49,10 @@ Examples:
   voxcast demo -o demo-out --precision f32             (in floating point: slower, and hardly another result)
   voxcast demo -o demo-out --threads 1                 (the same digest as with any other number of threads)
   voxcast demo -o demo-out --threads 1 --isa scalar    (the same digest again)
+  voxcast demo -o demo-out --model model.safetensors   (another network)
 
-It writes the scene with its labels, the model, the rig, occupancy.npz, occupancy.png and demo.html, a page to look at in a
-browser: prediction, truth and difference as voxels to turn.")]
+It writes the scene with its labels, the model unless one is given, the rig, occupancy.npz, occupancy.png and demo.html, a
+page to look at in a browser: prediction, truth and difference as voxels to turn.")]
 pub struct Demo {
     /// Directory for scene/, model, rig, occupancy, picture and page
     #[arg(short, long, value_name = "DIR", default_value = "voxcast-demo")]
@@ -49,7 +61,10 @@ pub struct Demo {
     #[arg(long, default_value = "int8", value_parser = ["f32", "f16", "int8", "i8"], hide_possible_values = true,
         value_name = "f32|f16|int8")]
     precision: String,
-    /// Which street is drawn; the network was trained on 0 to 5434
+    /// A model to run, as it is, in place of the network that ships
+    #[arg(long, value_name = "FILE", conflicts_with = "precision")]
+    model: Option<PathBuf>,
+    /// Which street is drawn; the network that ships was trained on 0 to 5434
     #[arg(long, default_value_t = 1_000_006)]
     seed: u64,
     #[command(flatten)]
@@ -58,14 +73,25 @@ pub struct Demo {
 
 impl Demo {
     pub fn run(self) -> Result<()> {
+        let shipped = if self.model.is_none() { Some(edge()?) } else { None };
         let directory = &self.output;
         frame::create_directory(directory)?;
         let options = frame::options(&self.machine)?;
 
-        let model_path = directory.join("model.safetensors");
-        write_model(&model_path, Precision::parse(&self.precision).unwrap_or(Precision::I8), &options)?;
-        let model = Arc::new(Model::open(&model_path)?);
+        let path = self.model.clone().unwrap_or_else(|| directory.join("model.safetensors"));
+        let outputs =
+            ["rig.safetensors", "occupancy.npz", "occupancy.png", "demo.html"].map(|name| directory.join(name));
+        frame::check_outputs([("--model", &path)], outputs.iter().map(|output| ("--output", output)))?;
+        if let Some(edge) = shipped {
+            write_model(edge, &path, Precision::parse(&self.precision).unwrap_or(Precision::I8), &options)?;
+        }
+        let model = Arc::new(Model::open(&path)?);
         let network = model.network();
+        if network.classes != CLASSES.len() {
+            let (found, expected) = (network.classes, CLASSES.len());
+            let message = format!("a network of {found} classes, expected the {expected} of drawn streets");
+            return Err(Error::mismatch(message).in_file(&path));
+        }
         let start = Instant::now();
         let drawn = Synthesiser::new(network)?.frame(self.seed);
         drawn.save_scene(&directory.join("scene"), Grid::of(network))?;
@@ -77,7 +103,7 @@ impl Demo {
         tell!("six matrices built in {}", terminal::time(start.elapsed()))?;
         rig.save(&directory.join("rig.safetensors"), network)?;
 
-        let mut session = Session::new(model.clone(), rig, &options)?;
+        let mut session = frame::session(&model, rig, &options)?;
         tell!("session of {} planned", terminal::bytes(session.taken().total()))?;
         // The first frame waits for the model's pages.
         session.run(&views(&drawn.scene))?;
@@ -99,24 +125,34 @@ impl Demo {
         let score = score(&drawn, &result);
         tell!("{score}")?;
         run::write(&directory.join("occupancy.npz"), network, &result, false)?;
-        draw(&directory.join("occupancy.png"), network, &drawn, &result, &score)?;
-        let titles = ["voxcast demo", "a street that the network was not trained on"];
+        let street = self.street();
+        draw(&directory.join("occupancy.png"), network, &drawn, &result, &format!("{street}: {score}"))?;
+        let titles = ["voxcast demo", street];
         let page = directory.join("demo.html");
         run::write_page(&page, network, &result, Some(&drawn.scene), Some(&drawn.labels), titles)?;
         let d = directory.display();
         tell!(
-            "see {d}/occupancy.png and {d}/demo.html; the same again: voxcast run --model {d}/model.safetensors {d}/scene -o out.npz"
+            "see {d}/occupancy.png and {d}/demo.html; the same again: voxcast run --model {} {d}/scene -o out.npz",
+            path.display()
         )?;
         Ok(())
     }
+
+    /// What is known of the street.
+    fn street(&self) -> &'static str {
+        match self.model {
+            None => "a street that the network was not trained on",
+            Some(_) => "a drawn street",
+        }
+    }
 }
 
-/// Writes the network that ships with the program in a precision.
-fn write_model(path: &Path, precision: Precision, options: &SessionOptions) -> Result<()> {
+/// Writes the network that ships in a precision.
+fn write_model(edge: &'static [u8], path: &Path, precision: Precision, options: &SessionOptions) -> Result<()> {
     if precision == Precision::F16 {
-        return voxcast::model::write_bytes(path, EDGE);
+        return voxcast::model::write_bytes(path, edge);
     }
-    let shipped = Model::from_bytes(EDGE)?;
+    let shipped = Model::from_bytes(edge)?;
     let (source, network, rewrites) = (Unpacked::new(&shipped)?, shipped.network(), Rewrites::ALL);
     if precision == Precision::I8 {
         let ranges = Ranges::from_json(EDGE_RANGES, network)?;
@@ -143,7 +179,7 @@ fn score(drawn: &Frame, result: &Occupancy<'_>) -> String {
 }
 
 /// The picture: images, prediction and truth.
-fn draw(path: &Path, network: &Network, drawn: &Frame, result: &Occupancy<'_>, score: &str) -> Result<()> {
+fn draw(path: &Path, network: &Network, drawn: &Frame, result: &Occupancy<'_>, what: &str) -> Result<()> {
     let palette = Palette::of(network.classes);
     let grid = result.grid;
     let occupancy = |caption, classes| picture::Occupancy::new(caption, classes, grid, grid.forward());
@@ -151,8 +187,12 @@ fn draw(path: &Path, network: &Network, drawn: &Frame, result: &Occupancy<'_>, s
         [occupancy("prediction", result.classes)?.with_support(result.support)?, occupancy("truth", &drawn.labels)?];
     let images: Vec<_> = drawn.scene.names.iter().map(String::as_str).zip(&drawn.scene.images).collect();
     let [height, width] = network.image;
-    let subtitle =
-        format!("six cameras of {height} x {width} pixels, a street that the network was not trained on: {score}");
+    let cameras = match images.len() {
+        6 => "six cameras".to_owned(),
+        1 => "one camera".to_owned(),
+        cameras => format!("{cameras} cameras"),
+    };
+    let subtitle = format!("{cameras} of {height} x {width} pixels, {what}");
     let figure = Figure {
         title: "voxcast demo",
         subtitle: &subtitle,

@@ -117,6 +117,7 @@ fn the_whole_path() {
     }
 }
 
+#[cfg(feature = "shipped")]
 #[test]
 fn the_demo_needs_no_other_file() {
     let place = tempfile::tempdir().unwrap();
@@ -149,6 +150,44 @@ fn the_demo_needs_no_other_file() {
     viewed["title"] = shown["title"].clone();
     viewed["subtitle"] = shown["subtitle"].clone();
     assert!(viewed == shown);
+}
+
+#[test]
+fn the_demo_of_a_model() {
+    let place = tempfile::tempdir().unwrap();
+    let text = |name: &str| place.path().join(name).to_str().unwrap().to_owned();
+    let [directory, model, out] = ["demo", "model.safetensors", "again.npz"].map(text);
+    fs::copy(concat!(env!("CARGO_MANIFEST_DIR"), "/assets/edge.safetensors"), &model).unwrap();
+    let told = done(&["demo", "-o", &directory, "--threads", "2", "--model", &model]);
+    assert!(told.contains("mIoU") && told.contains(&format!("run --model {model} ")), "{told}");
+    let file = |name: &str| format!("{directory}/{name}");
+    done(&["run", "--model", &model, "--rig", &file("rig.safetensors"), &file("scene"), "-o", &out]);
+    assert_eq!(fs::read(file("occupancy.npz")).unwrap(), fs::read(&out).unwrap());
+    assert_eq!(page(&file("demo.html"))["subtitle"], json!("a drawn street"));
+    assert!(!Path::new(&file("model.safetensors")).exists(), "a copy of what is there");
+
+    // A model that what is written would replace, one of other classes, and precisions, of which a model has one.
+    let rig = file("rig.safetensors");
+    fs::copy(&model, &rig).unwrap();
+    let line = refused(&rig, &["demo", "-o", &directory, "--model", &rig]);
+    assert!(line.contains("--model and --output name the same file"), "{line}");
+    let other = Place::ready();
+    let small = other.text("model");
+    let line = refused(&small, &["demo", "-o", &directory, "--model", &small]);
+    assert!(line.contains("a network of 19 classes, expected the 17 of drawn streets"), "{line}");
+    let output = voxcast(&["demo", "-o", &directory, "--model", &model, "--precision", "f16"]);
+    assert_eq!(output.status.code(), Some(2), "{output:?}");
+}
+
+#[cfg(not(feature = "shipped"))]
+#[test]
+fn the_demo_without_the_network_that_ships() {
+    let place = tempfile::tempdir().unwrap();
+    let directory = place.path().join("demo").to_str().unwrap().to_owned();
+    for precision in ["f32", "f16", "int8"] {
+        let line = refused("--model FILE", &["demo", "-o", &directory, "--precision", precision]);
+        assert!(line.contains("built without the network that ships"), "{line}");
+    }
 }
 
 /// The data of a page.
