@@ -6,7 +6,9 @@ import subprocess
 import sys
 import tempfile
 import unittest
+from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy
 import torch
@@ -23,6 +25,7 @@ from voxcast_train.data import Frames  # noqa: E402
 from voxcast_train.errors import InputError  # noqa: E402
 from voxcast_train.evaluate import covered_by, evaluate, evaluate_majority, evaluate_masked, load_model  # noqa: E402
 from voxcast_train.export import export  # noqa: E402
+from voxcast_train.losses import level_losses  # noqa: E402
 from voxcast_train.metrics import Confusion  # noqa: E402
 from voxcast_train.network import InverseMatrixVT3D, Network, initialise  # noqa: E402
 from voxcast_train.program import Program  # noqa: E402
@@ -340,6 +343,47 @@ class FromSeeds(unittest.TestCase):
                     # A bias before a batch norm that keeps its statistics has a gradient too.
                     changes = name.startswith(trained) and not name.endswith(kept)
                     self.assertEqual(torch.equal(tensor, before[name]), not changes, name)
+
+    def test_an_interrupted_tail_takes_the_steps_that_it_would_have_taken(self):
+        made_up.write_network(self.work)
+        made_up.write_set(self.work / "train", 0, 4)
+        voxcast("rig", next((self.work / "train").iterdir()), "--network", self.work / "network.json", "-o", self.work / "rig.safetensors")
+        network = Network.load(self.work / "network.json")
+        frames, rig = Frames([self.work / "train"], network, pixels=False), Rig.load(self.work / "rig.safetensors", network)
+        new = InverseMatrixVT3D(network)
+        initialise(new)
+        state, output = self.work / "tail.pt", self.work / "tail.safetensors"
+        tail = Tail(steps=6, batch=2, learning_rate=1e-3, lovasz_voxels=500, volumes=True)
+
+        def trained(tail: Tail, **options) -> dict:
+            model = InverseMatrixVT3D(network)
+            model.load_state_dict(new.state_dict())
+            self.assertEqual(train_tail(model, [(rig, frames)], tail, CPU, **options), tail.steps)
+            return model.state_dict()
+
+        whole = trained(tail)
+        left = iter(range(4))
+
+        def interrupted(*arguments):
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+            return level_losses(*arguments)
+
+        with patch("voxcast_train.tail.level_losses", interrupted), self.assertRaises(KeyboardInterrupt):
+            trained(tail, state=state, output=output, save_seconds=0.0)
+        self.assertEqual(torch.load(state, weights_only=True)["step"], 4)
+        halfway = load_model(network, output).state_dict()
+        parts = trained(tail, state=state, output=output, save_seconds=0.0)
+        for name, tensor in whole.items():
+            self.assertTrue(torch.equal(tensor, parts[name]), name)
+        written = load_model(network, output).state_dict()
+        self.assertTrue(any(not torch.equal(tensor, written[name]) for name, tensor in halfway.items()), "the output follows the run")
+        # One that is over gives its result again, a longer one goes on, and another run is refused.
+        again = trained(tail, state=state)
+        self.assertTrue(all(torch.equal(tensor, again[name]) for name, tensor in whole.items()))
+        trained(replace(tail, steps=7), state=state)
+        with self.assertRaisesRegex(InputError, "tail.pt: average: found 0.99, expected 0.9;"):
+            trained(replace(tail, average=0.9), state=state)
 
     def test_one_look_at_the_images_scores_every_mask(self):
         made_up.write_network(self.work)

@@ -58,6 +58,8 @@ class Tail:
     """Time to train for, instead of steps."""
     batch: int = 4
     learning_rate: float = 1e-3
+    average: float = 0.99
+    """Decay of the running average of the weights, which is what is kept."""
     masked: float = 0.2
     lovasz_voxels: int = 60_000
     volumes: bool = False

@@ -58,7 +58,8 @@ def train_model(config: Config, work: Path, voxcast: Program, device: torch.devi
     model = InverseMatrixVT3D(network)
     model.load_state_dict(state["average"])
     if config.tail is not None:
-        train_tail(model, tail_sets(config, work, names, lidar2img, rig, voxcast, device), config.tail, device, config.seed)
+        sets = tail_sets(config, work, names, lidar2img, rig, voxcast, device)
+        train_tail(model, sets, config.tail, device, config.seed, work / "tail.pt")
     export(calibrated(model, rig, tuning, device), work / "checkpoint.safetensors", half=True)
     voxcast("import", work / "checkpoint.safetensors", "--network", network_path, "--precision", "f16", "--exact", "-o",
             work / "model.safetensors")  # fmt: skip
