@@ -321,7 +321,8 @@ class FromSeeds(unittest.TestCase):
         # The model is one of the network, and its function that of the checkpoint.
         voxcast("selftest", self.work / "run" / "model.safetensors")
 
-    def test_the_end_alone_gets_better_and_nothing_else_changes(self):
+    def four_frames(self) -> tuple:
+        """A network, four frames and the rig that they have, and a model of which nothing is trained."""
         made_up.write_network(self.work)
         made_up.write_set(self.work / "train", 0, 4)
         voxcast("rig", next((self.work / "train").iterdir()), "--network", self.work / "network.json", "-o", self.work / "rig.safetensors")
@@ -329,6 +330,10 @@ class FromSeeds(unittest.TestCase):
         frames, rig = Frames([self.work / "train"], network, pixels=False), Rig.load(self.work / "rig.safetensors", network)
         new = InverseMatrixVT3D(network)
         initialise(new)
+        return network, frames, rig, new
+
+    def test_the_end_alone_gets_better_and_nothing_else_changes(self):
+        network, frames, rig, new = self.four_frames()
         before = {name: tensor.clone() for name, tensor in new.state_dict().items()}
         first = evaluate(new, rig, frames, CPU).report()["all"]["iou"]
         kept = ("running_mean", "running_var", "num_batches_tracked", "attention_bias_idxs")
@@ -345,13 +350,7 @@ class FromSeeds(unittest.TestCase):
                     self.assertEqual(torch.equal(tensor, before[name]), not changes, name)
 
     def test_an_interrupted_tail_takes_the_steps_that_it_would_have_taken(self):
-        made_up.write_network(self.work)
-        made_up.write_set(self.work / "train", 0, 4)
-        voxcast("rig", next((self.work / "train").iterdir()), "--network", self.work / "network.json", "-o", self.work / "rig.safetensors")
-        network = Network.load(self.work / "network.json")
-        frames, rig = Frames([self.work / "train"], network, pixels=False), Rig.load(self.work / "rig.safetensors", network)
-        new = InverseMatrixVT3D(network)
-        initialise(new)
+        network, frames, rig, new = self.four_frames()
         state, output = self.work / "tail.pt", self.work / "tail.safetensors"
         tail = Tail(steps=6, batch=2, learning_rate=1e-3, lovasz_voxels=500, volumes=True)
 

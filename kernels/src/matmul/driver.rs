@@ -48,11 +48,11 @@ pub(crate) const DEPTH: usize = depth::<f32>();
 /// f32 of a block of rows.
 pub(crate) const BLOCK_LEN: usize = BLOCK_ROWS * stride::<f32>();
 /// f32 of the panels of a tile in one k block.
-pub(crate) const PANEL_LEN: usize = if DEPTH > TURNS * TURNS_DEPTH { DEPTH } else { TURNS * TURNS_DEPTH } * LANES;
+pub(crate) const PANEL_LEN: usize = LANES * if DEPTH > TURNS * TURNS_DEPTH { DEPTH } else { TURNS * TURNS_DEPTH };
 
 /// Tiles that take turns.
 const TURNS: usize = 2;
-/// Depth of a k block in f32 up to which they do.
+/// Depth of a k block up to which they do, at most 16 KiB a panel.
 const TURNS_DEPTH: usize = 256;
 
 /// The left matrix. It is not stored: a source names, piece by piece, where the elements of a row lie, and copies (or

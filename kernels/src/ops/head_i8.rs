@@ -104,18 +104,18 @@ impl<'a> HeadI8<'a> {
 }
 
 /// Rows that lie in memory, densely.
-struct Rows<'a, E> {
-    data: &'a [E],
+struct Rows<'a> {
+    data: &'a [i8],
     stride: usize,
 }
 
-impl<E: Copy> Source for Rows<'_, E> {
-    type Element = E;
+impl Source for Rows<'_> {
+    type Element = i8;
     type At = usize;
     type Part = usize;
 
     #[inline(always)]
-    fn element(&self, row: usize, k: usize) -> E {
+    fn element(&self, row: usize, k: usize) -> i8 {
         self.data[row * self.stride + k]
     }
     #[inline(always)]
@@ -131,7 +131,7 @@ impl<E: Copy> Source for Rows<'_, E> {
         (k, self.stride - k)
     }
     #[inline(always)]
-    fn piece<'a, S: Simd>(&'a self, _: S, row: usize, k: usize, spare: &'a mut [E]) -> &'a [E] {
+    fn piece<'a, S: Simd>(&'a self, _: S, row: usize, k: usize, spare: &'a mut [i8]) -> &'a [i8] {
         &self.data[row * self.stride + k..][..spare.len()]
     }
 }
