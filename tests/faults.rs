@@ -13,7 +13,7 @@ use voxcast::weights::Precision;
 use voxcast::{Budget, Isa, Model, Session, SessionOptions, Step, Threads};
 
 /// Page faults of this process so far, those that read a disk and those that did not.
-fn faults() -> [i64; 2] {
+fn faults() -> [libc::c_long; 2] {
     // SAFETY: zeros are a valid `rusage`.
     let mut usage: libc::rusage = unsafe { std::mem::zeroed() };
     // SAFETY: `usage` is writable and of the type that the call fills.

@@ -110,20 +110,23 @@ fn listed(bytes: &[u8]) -> Result<Vec<String>> {
             }
         }
     }
+    // As paths, for `a//b` is the file `a/b`.
     let mut seen = BTreeSet::new();
-    match frames.iter().find(|frame| !seen.insert(*frame)) {
+    match frames.iter().find(|frame| !seen.insert(Path::new(*frame))) {
         Some(twice) => Err(Error::format(format!("frame {twice:?} is there twice"))),
         None if frames.is_empty() => Err(Error::format("no frames, expected some")),
         None => Ok(frames),
     }
 }
 
-/// The name of a frame, whose file is named.
+/// The name of a frame, whose file is named. It is a path below the set as well, for results may be named after it: `..npz`
+/// and `a/.npz` are files, but `.` and `a/` are no frames.
 fn frame_of(pickle: &Pickle<'_, NumPy>, id: Id) -> Result<String> {
     let path = string(pickle, id).map_err(|found| Error::format(format!("the file of a frame is {found}")))?;
-    match path.strip_suffix(".npz").filter(|_| is_inside(path)) {
+    let named = |frame: &&str| is_inside(path) && is_inside(frame) && !frame.ends_with('/');
+    match path.strip_suffix(".npz").filter(named) {
         Some(frame) => Ok(frame.to_owned()),
-        None => Err(Error::format(format!("file {path:?}, expected an .npz below the set"))),
+        None => Err(Error::format(format!("file {path:?}, expected a named .npz below the set"))),
     }
 }
 
