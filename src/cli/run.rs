@@ -4,7 +4,7 @@ use super::dump::Dump;
 use super::terminal::tell;
 use super::view::name_of;
 use super::{Machine, frame, terminal};
-use clap::Args;
+use clap::{ArgGroup, Args};
 use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -22,7 +22,7 @@ use voxcast::{Error, Network, Note, Result, Scene};
 /// Latencies are those of all scenes but the first, which stands apart: it also waits for the model's pages. A log (.mcap)
 /// of Foxglove's messages or a ROS 2 bag is run likewise, frame by frame; with -o OUT.mcap results become a log.
 #[derive(Args, Debug)]
-#[command(after_help = "\
+#[command(group(ArgGroup::new("pictures").multiple(true)), after_help = "\
 Examples:
   voxcast run --model model.safetensors scene/ -o out.npz
   voxcast run --model model.safetensors --rig rig.safetensors scene/ -o out.npz --logits --png out.png
@@ -70,16 +70,16 @@ pub struct Run {
     #[arg(long)]
     pub(super) confidence: bool,
     /// In pictures, leave out voxels that are occupied with a lower probability than P, 0 to 1
-    #[arg(long, value_name = "P", value_parser = probability)]
+    #[arg(long, value_name = "P", value_parser = probability, requires = "pictures")]
     pub(super) hide_below: Option<f32>,
     /// Draw images, bird's-eye view and voxels
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", group = "pictures")]
     pub(super) png: Option<PathBuf>,
     /// Write a page to look at in a browser: voxels to turn, and the images with the voxels on them
     #[arg(long, value_name = "FILE")]
     pub(super) html: Option<PathBuf>,
     /// Of a sequence: draw images, map and voxels of every scene as one animated PNG
-    #[arg(long, value_name = "FILE.png")]
+    #[arg(long, value_name = "FILE.png", group = "pictures")]
     pub(super) animation: Option<PathBuf>,
     /// Pictures of the animation per second
     #[arg(long, value_name = "N", default_value_t = 4, requires = "animation", value_parser = clap::value_parser!(u16).range(1..=50))]

@@ -67,6 +67,11 @@ fn the_whole_path() {
     };
     assert!(picture(&["--hide-below", "0"]) == picture(&[]), "nothing is less likely than 0");
     assert_eq!(voxcast(&["run", "--model", &model, &scene, "-o", &out, "--hide-below", "1.5"]).status.code(), Some(2));
+    let aimless = voxcast(&["run", "--model", &model, &scene, "-o", &out, "--hide-below", "0.5"]);
+    assert!(
+        aimless.status.code() == Some(2) && text(&aimless.stderr).contains("--png <FILE>|--animation <FILE.png>"),
+        "{aimless:?}"
+    );
     assert!(all.contains(&0) && all.iter().any(|&n| n > 1), "seen and unseen places");
     let masked = run(&["--mask", "1"]);
     assert_ne!(masked["digest"], summary["digest"]);

@@ -1,13 +1,14 @@
 //! Sets that `voxcast synth --set` wrote: `set.json`, and a `.safetensors` per seed.
 
 use super::{DataSet, Grid, Pose, Truth, check_labels};
-use crate::base::error::{Error, Result};
+use crate::base::error::{Error, ErrorKind, Result};
 use crate::base::note::Note;
 use crate::file::container::Container;
 use crate::network::Network;
 use crate::scene::Scene;
 use crate::synth::{CLASSES, SET_FORMAT};
 use safetensors::Dtype;
+use std::io;
 use std::path::{Path, PathBuf};
 
 /// A synthetic set: frames in the order of their seeds, with the mask `visible`.
@@ -23,11 +24,17 @@ impl Synthetic {
     /// Opens the set in `directory`. Frames are listed, not read.
     ///
     /// # Errors
-    /// [`ErrorKind::Io`](crate::ErrorKind::Io) if `set.json` or the directory cannot be read;
-    /// [`ErrorKind::Format`](crate::ErrorKind::Format) if `set.json` is not that of a set, or there is no frame.
+    /// [`ErrorKind::Io`] if `set.json` or the directory cannot be read;
+    /// [`ErrorKind::Format`] if `set.json` is not that of a set, or there is no frame.
     pub fn open(directory: &Path) -> Result<Self> {
         let path = directory.join("set.json");
-        let text = std::fs::read_to_string(&path).map_err(|e| Error::io(&path, "read", &e))?;
+        let text = std::fs::read_to_string(&path).map_err(|e| match e.kind() {
+            io::ErrorKind::NotFound => {
+                Error::new(ErrorKind::Io, "there is none, expected the directory of a set that synth --set wrote")
+                    .in_file(&path)
+            }
+            _ => Error::io(&path, "read", &e),
+        })?;
         let network = read_set(&text).map_err(|e| e.in_file(&path))?;
         let failed = |e: &std::io::Error| Error::io(directory, "read", e);
         let mut seeds = Vec::new();

@@ -68,7 +68,7 @@ fn what_is_no_set_is_refused_with_its_file() {
         let error = Synthetic::open(path).expect_err(expected);
         assert!(error.to_string().contains(expected), "{error}");
     };
-    refused("set.json");
+    refused("set.json: there is none, expected the directory of a set that synth --set wrote");
     set_json(path, "voxcast-synth-9");
     refused("found \"voxcast-synth-9\", expected \"voxcast-synth-1\"");
     set_json(path, "voxcast-synth-1");
