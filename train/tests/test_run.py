@@ -12,6 +12,7 @@ from unittest.mock import patch
 
 import numpy
 import torch
+from safetensors.torch import load_file
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
@@ -20,6 +21,7 @@ sys.path.insert(0, str(HERE))
 import made_up  # noqa: E402
 
 from voxcast_train.across import summary  # noqa: E402
+from voxcast_train.calibrate import BIAS  # noqa: E402
 from voxcast_train.config import Config, Tail  # noqa: E402
 from voxcast_train.data import Frames  # noqa: E402
 from voxcast_train.errors import InputError  # noqa: E402
@@ -295,7 +297,7 @@ class FromSeeds(unittest.TestCase):
         return Config.load(path)
 
     def test_frames_are_drawn_beside_and_a_model_comes_out(self):
-        first = self.config("first")
+        first = self.config("first", shifts=False)
         ring = {"rigs": 1, "degrees": 1, "metres": 0.05, "share": 0.5}
         tail = {"first": 20000, "count": 4, "steps": 2, "batch": 2, "lovasz_voxels": 500, "volumes": True, "jitter": ring}
         config = self.config("second", after="first.json", tail=tail, minutes=0.02, steps=100, phases=[{"start": 0}])
@@ -306,6 +308,9 @@ class FromSeeds(unittest.TestCase):
         taught = [row for row in rows if row["kind"] == "train"]
         self.assertEqual([(row["step"], "focal0" in row) for row in taught], [(4, False), (8, True)])
         self.assertTrue(4 <= taught[-1]["frames"] <= 24)
+        # Its logits were not shifted.
+        averaged = torch.load(run_of_first / "state.pt", weights_only=True)["average"][BIAS]
+        self.assertTrue(torch.equal(load_file(run_of_first / "checkpoint.safetensors")[BIAS], averaged))
         # The clock ended the other one.
         state = torch.load(self.work / "run" / "state.pt", weights_only=True)
         self.assertGreaterEqual(state["seconds"], 1.2)

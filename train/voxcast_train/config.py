@@ -105,6 +105,8 @@ class Config:
     """The other rigs to train for, if frames are drawn beside."""
     tail: Tail | None = None
     """What is done with the last stage afterwards, if anything."""
+    shifts: bool = True
+    """Whether one shift of the logits for each class is fitted to the tuning frames at the end (`calibrate.py`)."""
     masked: float = 0.0
     """Share of the frames of which one camera is masked: its pixels are left out of every mean."""
     seed: int = 0
@@ -197,7 +199,7 @@ class Config:
         other phases: from then on, the new ones count."""
         values = asdict(self)
         free = ("directory", "steps", "minutes", "phases", "threads", "drawers", "ready", "log_every", "save_every", "evaluate_every",
-                "save_seconds", "evaluate_seconds", "tune", "held_out", "tail")  # fmt: skip
+                "save_seconds", "evaluate_seconds", "tune", "held_out", "tail", "shifts")  # fmt: skip
         for key in free:
             del values[key]
         assert set(values) < {f.name for f in fields(self)}

@@ -54,13 +54,14 @@ def train_model(config: Config, work: Path, voxcast: Program, device: torch.devi
     run(config, work, device, start, voxcast)
     state = torch.load(work / "state.pt", map_location="cpu", weights_only=True)
     rig = Rigs([Rig.load(plain / "rig.safetensors", network)], device).select(0)
-    tuning = Frames([work / "tune"], network, pixels=False, limit=config.tune.count)
     model = InverseMatrixVT3D(network)
     model.load_state_dict(state["average"])
     if config.tail is not None:
         sets = tail_sets(config, work, names, lidar2img, rig, voxcast, device)
         train_tail(model, sets, config.tail, device, config.seed, work / "tail.pt")
-    export(calibrated(model, rig, tuning, device), work / "checkpoint.safetensors", half=True)
+    tuning = Frames([work / "tune"], network, pixels=False, limit=config.tune.count)
+    weights = calibrated(model, rig, tuning, device) if config.shifts else model.state_dict()
+    export(weights, work / "checkpoint.safetensors", half=True)
     voxcast("import", work / "checkpoint.safetensors", "--network", network_path, "--precision", "f16", "--exact", "-o",
             work / "model.safetensors")  # fmt: skip
     return state["step"]
