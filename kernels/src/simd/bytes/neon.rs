@@ -78,7 +78,8 @@ unsafe fn widen(sum: uint32x4_t, low: int16x8_t, high: int16x8_t) -> uint32x4_t 
     unsafe { vreinterpretq_u32_s32(vpadalq_s16(vreinterpretq_s32_u32(sum), vpaddq_s16(low, high))) }
 }
 
-/// Each group widened by itself: a 16-bit lane gets two products.
+/// Each group widened by itself: a 16-bit lane gets two products. Registers are loaded by halves, which `smull` takes as they
+/// are: of whole ones the compiler takes the upper half out first, and then has too few registers for the sums.
 ///
 /// # Safety
 /// As [`multiply`]; the CPU must have NEON.
@@ -91,18 +92,17 @@ unsafe fn plain<const N: usize, const P: usize>(
 ) -> [[Sums; P]; N] {
     // SAFETY: every group is below `depth`, so the caller's promise holds for all loads.
     unsafe {
-        for group in 0..depth / GROUP {
-            let mut a = [vdupq_n_s8(0); N];
+        for k in (0..depth).step_by(GROUP) {
+            let mut a = [vdup_n_s8(0); N];
             for r in 0..N {
-                a[r] = splat(left[r].add(group * GROUP));
+                a[r] = vreinterpret_s8_s32(vdup_n_s32(left[r].add(k).cast::<i32>().read_unaligned()));
             }
             for j in 0..P {
                 for q in 0..QUARTER {
-                    let w = vld1q_s8(panels[j].add(group * STEP + q * WIDTH));
+                    let w = panels[j].add(k * LANES + q * WIDTH);
+                    let (w, next) = (vld1_s8(w), vld1_s8(w.add(WIDTH / 2)));
                     for r in 0..N {
-                        let low = vmull_s8(vget_low_s8(w), vget_low_s8(a[r]));
-                        let high = vmull_high_s8(w, a[r]);
-                        sums[r][j][q] = widen(sums[r][j][q], low, high);
+                        sums[r][j][q] = widen(sums[r][j][q], vmull_s8(w, a[r]), vmull_s8(next, a[r]));
                     }
                 }
             }
