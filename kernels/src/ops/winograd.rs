@@ -231,13 +231,25 @@ impl Shape {
         };
         assert!(known, "{} taps across layers", self.layer_taps);
         assert!(self.channels > 0 && self.channels.is_multiple_of(LANES), "channels come in sixteens");
-        let numbers = [self.plane[1], self.layers, self.channels.max(self.columns).max(64), 64 * 8];
-        let count = numbers.iter().try_fold(self.plane[0], |a, &b| a.checked_mul(b));
-        let weights = self.channels.checked_mul(self.columns.max(LANES)).and_then(|v| v.checked_mul(64 * 16));
-        assert!(
-            count.is_some_and(|v| isize::try_from(v).is_ok()) && weights.is_some_and(|v| isize::try_from(v).is_ok()),
-            "the shape overflows"
-        );
+        assert!(self.fits(isize::MAX as usize), "the shape overflows");
+    }
+
+    /// Whether each of input, outputs, transformed weights and scratch takes at most `bytes`.
+    fn fits(&self, bytes: usize) -> bool {
+        let within = |numbers: &[usize]| {
+            let size = numbers.iter().try_fold(size_of::<f32>(), |a, &b| a.checked_mul(b));
+            size.is_some_and(|size| size <= bytes)
+        };
+        let columns = self.columns.saturating_add(LANES);
+        // Points, taps across layers and parts of the weights make at most 256. At each of at most 64 points scratch has at most
+        // ROWS rows of sums and three times as many of inputs, both padded.
+        within(&[
+            self.plane[0],
+            self.plane[1],
+            self.layers,
+            self.channels.max(self.columns.saturating_mul(self.parts())),
+        ]) && within(&[256, self.channels, columns])
+            && within(&[64, 5, ROWS, self.channels.max(COLUMNS)])
     }
 }
 

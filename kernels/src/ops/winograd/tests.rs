@@ -464,6 +464,20 @@ fn three_taps_of_a_transposed_convolution() {
 }
 
 #[test]
+fn volumes_of_many_megabytes_fit_32_bits() {
+    let bytes = i32::MAX as usize;
+    for scheme in SCHEMES {
+        assert!(volume([100, 100], 16, 64, 64, scheme).fits(bytes));
+        assert!(image([928, 1600], 64, 64, scheme).fits(bytes));
+        assert!(!image([1 << 13, 1 << 12], 16, 16, scheme).fits(bytes), "2 GiB of inputs");
+        assert!(!image([8, 8], 1 << 15, 16, scheme).fits(bytes), "2 GiB of scratch");
+        assert!(!image([8, 8], 1 << 11, 1 << 11, scheme).fits(bytes), "2 GiB of weights, at most");
+    }
+    assert!(doubled([100, 100], 8, 64, 32).fits(bytes));
+    assert!(!doubled([256, 256], 64, 16, 16).fits(bytes), "2 GiB of outputs");
+}
+
+#[test]
 #[should_panic(expected = "the shape overflows")]
 fn positions_that_cannot_be_counted() {
     broken(|case| case.shape.plane[0] = usize::MAX / 64);
